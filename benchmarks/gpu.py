@@ -164,7 +164,7 @@ def steps(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
 
 def step_of(number: int, size_hw: tuple[int, int], device: str) -> dict[str, Any]:
     gaussians, camera = random_scene(number, size_hw)
-    picture = render(gaussians, camera, threads=CORES).clip(0, 1)
+    picture = render(gaussians, camera, threads=CORES).colours.clip(0, 1)
     view = TrainingView(camera, (255 * picture).astype(np.uint8))
     model = model_on("cuda")({name: getattr(gaussians, name).copy() for name in FIELDS}, 1)
     state = FitState(model, np.random.default_rng(0))
@@ -221,7 +221,7 @@ def fitted(device: str, number: int, views: int, side_px: int, iterations: int) 
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         for name in cameras.names:
-            picture = render(gaussians, cameras[name], threads=CORES)
+            picture = render(gaussians, cameras[name], threads=CORES).colours
             write_png(folder / "images" / name, (255 * picture.clip(0, 1)).astype(np.uint8))
         colours = np.full((len(start), 3), 128, np.uint8)
         split = dict.fromkeys(cameras.names, "train")

@@ -27,8 +27,7 @@ from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
-from hilsplat.semantic_tree.evidence import mask_evidence
-from hilsplat.semantic_tree.linkage import pooled_linkage
+from hilsplat.semantic_tree.linkage import mask_evidence, pooled_linkage
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.semantic_tree.view_pairs import view_pairs
 from hilsplat.settings import AutoencoderSettings
@@ -205,7 +204,7 @@ def test_conjugate_gradient(benchmark):
     n = np.asarray(B.sum(axis=1)).ravel().astype(np.float32)
     A = sp.csr_matrix(sp.diags(1 / n) @ B @ W, dtype=np.float32)
     latents = unit(np.random.default_rng(1).normal(size=(90, 8)))
-    masks = MaskOperator.of(A, np.repeat(np.array([1, 2, 3], np.uint8), 30))
+    masks = MaskOperator(A, np.repeat(np.array([1, 2, 3], np.uint8), 30))
     quadratic = StackedWeights(W, np.ones((W.shape[0], 3), bool))
     problem = QuadraticProblem.of(masks, quadratic, n, latents, (1.0, 0.3, 0.1))
     benchmark.extra_info |= {"case": "ten steps of conjugate gradient", "count": 30 * W.nnz, "of": "weights"}

@@ -173,5 +173,6 @@ def _radii(view: views.Projected) -> np.ndarray:
         scale = 2 * LOG2_E / (4 * a * c - b * b)  # the covariance is the inverse of the conic
         variances = np.stack([c * scale, a * scale], axis=1)
         sigmas = np.sqrt(2 * LN_2 * (top - LOG2_MIN_ALPHA)).clip(max=MAX_SIGMAS)
-        radii = np.ceil(sigmas[:, None] * np.sqrt(variances))
+        # NaN if the conic is 0
+        radii = np.fmin(np.ceil(sigmas[:, None] * np.sqrt(variances)), np.iinfo(np.int32).max)
     return np.where(view.drawn[:, None], radii, 0).astype(np.int32)

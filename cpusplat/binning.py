@@ -124,7 +124,7 @@ def _reach(mean_x, mean_y, a, b, c, top, along_x, along_y):
     return bits_ge(lanes(top + _SLACK) - least, lanes(_CUT))
 
 
-@compiled
+@compiled(error_model="numpy")  # a and c may be 0: such a Gaussian covers the view evenly
 def fill_lists(begin, end, base, tiles_x, order, tile_start, box, geometry, gaussian, reach, tile_end):
     """Write the lists of tiles begin..end and their ends; entry e is written to gaussian[e - base].
 

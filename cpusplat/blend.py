@@ -433,8 +433,7 @@ def sparse_rows(
                         at += np.int64((weight > _ZERO) & (weight >= least))
                     size_of[pixel] = at - pixel * room
         for pixel in range(PIXELS):
-            block, lane = pixel // LANES, pixel % LANES
-            x, y = x0 + (block & 3) * 4 + (lane & 3), y0 + (block >> 2) * 4 + (lane >> 2)
+            x, y = x0 + np.int64(_X[pixel]), y0 + np.int64(_Y[pixel])
             if x >= width or y >= height:
                 continue
             if out is None:

@@ -5,9 +5,8 @@ from typing import Any
 from llvmlite import binding, ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
 
-from cpusplat.lanes import LANES, WIDTH, splat
+from cpusplat.lanes import LANES, WIDTH, address_of, operation, splat
 
 _HAS_AVX512 = bool(binding.get_host_cpu_features().get("avx512f"))
 """With AVX-512, a core has 32 registers of 16 numbers each; without it, 16 registers of at most 8 numbers."""
@@ -28,53 +27,38 @@ def rows_of_products(rows: int) -> Any:
         per sum; whether sums start at zero, not at y; whether there are `WIDE_COLUMNS` columns, not `WIDTH`.
     """
 
-    @intrinsic
-    def add_products(typingctx, y, y0, y_step, a, a0, a_step, x, x0, x_step, inner, begin, wide):
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            y_data, a_data, x_data = (
-                context.make_array(sig.args[k])(context, builder, args[k]).data for k in (0, 3, 6)
-            )
-            (y_first, y_next), (a_first, a_next), (x_first, x_next) = args[1:3], args[4:6], args[7:9]
-            many, from_zero, both = args[9:]
-            zero = ir.Constant(LANES.vector, None)
+    @operation(types.void)
+    def add_products(builder, y, y0, y_step, a, a0, a_step, x, x0, x_step, inner, begin, wide):
+        def vectors(array: Any, start: Any, count: int) -> list[Any]:
+            starts = [builder.add(start, ir.Constant(start.type, k * WIDTH)) for k in range(count)]
+            return [address_of(builder, array, index, LANES.vector) for index in starts]
 
-            def vectors(data: Any, start: Any, count: int) -> list[Any]:
-                places = [builder.add(start, ir.Constant(start.type, k * WIDTH)) for k in range(count)]
-                return [builder.bitcast(builder.gep(data, [at]), LANES.vector.as_pointer()) for at in places]
+        def emit(count: int) -> None:
+            starts, row = [a0], y0
+            targets: list[Any] = []
+            for _ in range(rows):
+                targets += vectors(y, row, count)
+                row = builder.add(row, y_step)
+                starts.append(builder.add(starts[-1], a_step))
+            zero, sums = ir.Constant(LANES.vector, None), []
+            for target in targets:
+                before = builder.select(begin, zero, builder.load(target, align=4))
+                sums.append(cgutils.alloca_once_value(builder, before))
+            with cgutils.for_range(builder, inner) as loop:
+                at = builder.add(x0, builder.mul(loop.index, x_step))
+                loaded = [builder.load(address, align=4) for address in vectors(x, at, count)]
+                for number, total in enumerate(sums):
+                    index = builder.add(starts[number // count], loop.index)
+                    factor = splat(builder, builder.load(builder.gep(a, [index])))
+                    product = builder.fmul(factor, loaded[number % count], flags=("contract",))
+                    builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
+            for target, total in zip(targets, sums, strict=True):
+                builder.store(builder.load(total), target, align=4)
 
-            def emit(count: int) -> None:
-                starts, row = [a_first], y_first
-                sums: list[Any] = []
-                targets: list[Any] = []
-                for _ in range(rows):
-                    targets += vectors(y_data, row, count)
-                    row = builder.add(row, y_next)
-                    starts.append(builder.add(starts[-1], a_next))
-                for target in targets:
-                    before = builder.select(from_zero, zero, builder.load(target, align=4))
-                    sums.append(cgutils.alloca_once_value(builder, before))
-                with cgutils.for_range(builder, many) as loop:
-                    at = builder.add(x_first, builder.mul(loop.index, x_next))
-                    loaded = [builder.load(each, align=4) for each in vectors(x_data, at, count)]
-                    for number, total in enumerate(sums):
-                        index = builder.add(starts[number // count], loop.index)
-                        factor = builder.load(builder.gep(a_data, [index]))
-                        same = splat(builder, factor)
-                        product = builder.fmul(same, loaded[number % count], flags=("contract",))
-                        added = builder.fadd(builder.load(total), product, flags=("contract",))
-                        builder.store(added, total)
-                for target, total in zip(targets, sums, strict=True):
-                    builder.store(builder.load(total), target, align=4)
-
-            with builder.if_else(both) as (then, otherwise):
-                with then:
-                    emit(WIDE_COLUMNS // WIDTH)
-                with otherwise:
-                    emit(1)
-            return context.get_dummy_value()
-
-        arguments = (y, y0, y_step, a, a0, a_step, x, x0, x_step, inner)
-        numbers = (types.intp if isinstance(each, types.Integer) else each for each in arguments)
-        return types.void(*numbers, types.boolean, types.boolean), codegen
+        with builder.if_else(wide) as (then, otherwise):
+            with then:
+                emit(WIDE_COLUMNS // WIDTH)
+            with otherwise:
+                emit(1)
 
     return add_products

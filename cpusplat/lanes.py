@@ -23,8 +23,7 @@ from numba.extending import intrinsic, lower_builtin, lower_cast, models, regist
 from cpusplat.compiled import compiled
 
 WIDTH = 16
-_FLOAT = ir.FloatType()
-_INT = ir.IntType(32)
+_FLOAT, _DOUBLE, _INT = ir.FloatType(), ir.DoubleType(), ir.IntType(32)
 _VECTOR = ir.VectorType(_FLOAT, WIDTH)
 _INTS = ir.VectorType(_INT, WIDTH)
 # A product and a sum may be fused into one operation with one rounding; reordering is not allowed.
@@ -39,7 +38,7 @@ class LanesType(types.Type):
 
     def __init__(self, dtype: types.Float, width: int = WIDTH) -> None:
         self.dtype = dtype
-        self.vector = ir.VectorType(_FLOAT if dtype == types.float32 else ir.DoubleType(), width)
+        self.vector = ir.VectorType(_FLOAT if dtype == types.float32 else _DOUBLE, width)
         super().__init__(name=f"Lanes{width}({dtype})")
 
 
@@ -47,7 +46,6 @@ LANES = LanesType(types.float32)
 WIDE = LanesType(types.float64)
 QUAD = LanesType(types.float32, 4)
 """Four lanes, for rows of a few numbers: `quad`, `load_quad`, `store`, `plus` and `signs_of_difference`."""
-_OF = {types.float32: LANES, types.float64: WIDE}
 
 
 @register_model(LanesType)
@@ -83,6 +81,54 @@ _binary(operator.mul, lambda builder: builder.fmul)
 _binary(operator.truediv, lambda builder: builder.fdiv)
 
 
+@compiled
+@no_type_check
+def aligned(count):
+    """Allocate a float32 array that starts at a cache line, so that no vector spans two lines."""
+    room = np.empty(count + WIDTH, np.float32)
+    skip = (-(room.ctypes.data // 4)) % WIDTH
+    return room[skip : skip + count]
+
+
+def operation(result: Any, *kinds: types.Type) -> Any:
+    """Make an intrinsic from a function of the IR builder and the operands, with the addresses of arrays.
+
+    Args:
+        result: type of the result, or a function of the operands' types that returns it.
+        kinds: types to which operands are cast; without them, only integers are cast (to intp).
+    """
+
+    def decorate(emit: Any) -> Any:
+        @functools.wraps(emit)
+        def typed(typingctx, *operands):
+            given = kinds or [types.intp if isinstance(kind, types.Integer) else kind for kind in operands]
+            returned = result if isinstance(result, types.Type) else result(*operands)
+
+            def codegen(context, builder, sig, args):
+                values = [
+                    context.make_array(kind)(context, builder, value).data
+                    if isinstance(kind, types.Array)
+                    else value
+                    for kind, value in zip(sig.args, args, strict=True)
+                ]
+                emitted = emit(builder, *values)
+                return context.get_dummy_value() if returned == types.void else emitted
+
+            return returned(*given), codegen
+
+        return intrinsic(typed)
+
+    return decorate
+
+
+def _first(kind: types.Type, *_: types.Type) -> types.Type:
+    return kind
+
+
+def _lanes_of(array: types.Array, *_: types.Type) -> types.Type:
+    return {types.float32: LANES, types.float64: WIDE}[array.dtype]
+
+
 def _constant(value: float | int, kind: ir.VectorType = _VECTOR) -> ir.Constant:
     return ir.Constant(kind, [ir.Constant(kind.element, value)] * WIDTH)
 
@@ -94,106 +140,63 @@ def splat(builder: ir.IRBuilder, scalar: ir.Value, count: int = WIDTH) -> ir.Val
     return builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(_INT, count), [0] * count))
 
 
-def _pointer(
-    context: Any, builder: ir.IRBuilder, array_type: Any, array: ir.Value, index: ir.Value, kind: Any
-) -> ir.Value:
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), kind.vector.as_pointer())
+def address_of(builder: ir.IRBuilder, array: ir.Value, index: ir.Value, kind: ir.Type) -> ir.Value:
+    """Return the address of an array element, as that of a value of another type."""
+    return builder.bitcast(builder.gep(array, [index]), kind.as_pointer())
 
 
-def _load(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-    address = _pointer(context, builder, sig.args[0], args[0], args[1], sig.return_type)
-    return builder.load(address, align=sig.args[0].dtype.bitwidth // 8)
+def _load(builder: ir.IRBuilder, array: ir.Value, index: ir.Value, count: int) -> ir.Value:
+    kind = ir.VectorType(array.type.pointee, count)
+    return builder.load(address_of(builder, array, index, kind), align=_bytes(array))
 
 
-def _is_flat(array: Any) -> bool:
-    return isinstance(array, types.Array) and array.dtype in _OF and array.ndim == 1
+def _bytes(array: ir.Value) -> int:
+    return 8 if array.type.pointee == _DOUBLE else 4
 
 
-@compiled
-@no_type_check
-def aligned(count):
-    """Allocate a float32 array that starts at a cache line, so that no vector spans two lines."""
-    room = np.empty(count + WIDTH, np.float32)
-    skip = (-(room.ctypes.data // 4)) % WIDTH
-    return room[skip : skip + count]
-
-
-def _operation(result: types.Type, *kinds: types.Type) -> Any:
-    """Make an intrinsic for operands of these types from a function of the IR builder and their values."""
-
-    def decorate(emit: Any) -> Any:
-        @functools.wraps(emit)
-        def typed(typingctx, *operands):
-            return result(*kinds), lambda context, builder, sig, args: emit(builder, *args)
-
-        return intrinsic(typed)
-
-    return decorate
-
-
-@_operation(LANES, types.float32)
+@operation(LANES, types.float32)
 def lanes(builder, scalar):
     """Return lanes that all contain the same float32 number."""
     return splat(builder, scalar)
 
 
-@_operation(QUAD, types.float32)
+@operation(QUAD, types.float32)
 def quad(builder, scalar):
     """Return four lanes that all contain the same float32 number."""
     return splat(builder, scalar, 4)
 
 
-@intrinsic
-def load(typingctx, array, index):
+@operation(_lanes_of)
+def load(builder, array, index):
     """Load 16 consecutive numbers from a flat float32 or float64 array."""
-    return (_OF[array.dtype](array, types.intp), _load) if _is_flat(array) else None
+    return _load(builder, array, index, WIDTH)
 
 
-@intrinsic
-def load_quad(typingctx, array, index):
+@operation(QUAD)
+def load_quad(builder, array, index):
     """Load four consecutive numbers from a flat float32 array."""
-    return QUAD(array, types.intp), _load
+    return _load(builder, array, index, 4)
 
 
-@intrinsic
-def load_same(typingctx, array, index):
+@operation(_lanes_of)
+def load_same(builder, array, index):
     """Load one element of a flat array into all lanes; the index must not be negative."""
-    if not _is_flat(array):
-        return None
-
-    def codegen(context, builder, sig, args):
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        return splat(builder, builder.load(builder.gep(data, [args[1]])))
-
-    return _OF[array.dtype](array, types.intp), codegen
+    return splat(builder, builder.load(builder.gep(array, [index])))
 
 
-@intrinsic
-def store(typingctx, array, index, value):
+@operation(types.void)
+def store(builder, array, index, value):
     """Store the lanes as consecutive numbers of a flat array of the same type."""
-    if not (_is_flat(array) and isinstance(value, LanesType) and value.dtype == array.dtype):
-        return None
-
-    def codegen(context, builder, sig, args):
-        address = _pointer(context, builder, sig.args[0], args[0], args[1], value)
-        builder.store(args[2], address, align=array.dtype.bitwidth // 8)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, value), codegen
+    builder.store(value, address_of(builder, array, index, value.type), align=_bytes(array))
 
 
-@intrinsic
-def plus(typingctx, total, scales, values):
+@operation(_first)
+def plus(builder, total, scales, values):
     """Return total + scales * values; each product is rounded before it is added, as in plain loops."""
-
-    def codegen(context, builder, sig, args):
-        return builder.fadd(args[0], builder.fmul(args[1], args[2]))  # without flags, so never fused
-
-    return total(total, total, total), codegen
+    return builder.fadd(total, builder.fmul(scales, values))  # without flags, so never fused
 
 
-@_operation(QUAD, QUAD, QUAD, types.float32)
+@operation(QUAD, QUAD, QUAD, types.float32)
 def signs_of_difference(builder, a, b, scale):
     """Return scale where a > b, -scale where a < b, and 0 where a == b; NaN is preserved."""
     zeros = ir.Constant(QUAD.vector, None)
@@ -203,42 +206,35 @@ def signs_of_difference(builder, a, b, scale):
     return builder.select(above, up, builder.select(below, builder.fneg(up), apart))
 
 
-@intrinsic
-def add_products(typingctx, sums, at, a, b, c, scale):
+@operation(types.float64)
+def add_products(builder, sums, at, a, b, c, scale):
     """Add scale * (a, b, c, 0) to four float64 sums from index `at`, as one vector and never fused.
 
     Returns the previous value of the first sum.
     """
-
-    def codegen(context, builder, sig, args):
-        number, lane = ir.DoubleType(), ir.IntType(32)
-        four = ir.VectorType(number, 4)
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        address = builder.bitcast(builder.gep(data, [args[1]]), four.as_pointer())
-        weights = ir.Constant(four, [ir.Constant(number, 0.0)] * 4)
-        for index, value in enumerate(args[2:5]):
-            weights = builder.insert_element(weights, value, ir.Constant(lane, index))
-        before = builder.load(address, align=8)
-        products = builder.fmul(weights, splat(builder, args[5], 4))
-        builder.store(builder.fadd(before, products), address, align=8)
-        return builder.extract_element(before, ir.Constant(lane, 0))
-
-    return types.float64(sums, types.intp, *[types.float64] * 4), codegen
+    four = ir.VectorType(_DOUBLE, 4)
+    address, weights = address_of(builder, sums, at, four), ir.Constant(four, None)
+    for index, value in enumerate((a, b, c)):
+        weights = builder.insert_element(weights, value, ir.Constant(_INT, index))
+    before = builder.load(address, align=8)
+    products = builder.fmul(weights, splat(builder, scale, 4))
+    builder.store(builder.fadd(before, products), address, align=8)
+    return builder.extract_element(before, ir.Constant(_INT, 0))
 
 
-@_operation(WIDE, LANES)
+@operation(WIDE, LANES)
 def wide(builder, value):
     """Convert the lanes to float64."""
     return builder.fpext(value, WIDE.vector)
 
 
-@_operation(LANES, WIDE)
+@operation(LANES, WIDE)
 def narrow(builder, value):
     """Round the lanes to float32."""
     return builder.fptrunc(value, LANES.vector)
 
 
-@_operation(LANES, LANES)
+@operation(LANES, LANES)
 def exp2_negative(builder, value):
     """Compute 2**x for x in [-126, 0], with a relative error below 3e-7.
 
@@ -261,142 +257,106 @@ _EXP2 = [float(np.float32(c)) for c in _fit.convert(kind=np.polynomial.Polynomia
 """Coefficients, constant first, of the polynomial for 2**f on [-1, 0]."""
 
 
-def _select(condition: str, doc: str) -> Any:
-    def keep(typingctx, left, right, value):
-        if not (isinstance(value, LanesType) and left == right == value):
-            return None
+def _keep(condition: str) -> Any:
+    def keep(builder, left, right, value):
+        mask = builder.fcmp_ordered(condition, left, right)
+        return builder.select(mask, value, ir.Constant(value.type, None))
 
-        def codegen(context, builder, sig, args):
-            mask = builder.fcmp_ordered(condition, args[0], args[1])
-            return builder.select(mask, args[2], ir.Constant(value.vector, None))
-
-        return value(left, right, value), codegen
-
-    keep.__doc__ = doc
-    return intrinsic(keep)
+    return operation(_first)(keep)
 
 
-keep_ge = _select(">=", "Lanes of `value` where left >= right, 0 elsewhere.")
-keep_gt = _select(">", "Lanes of `value` where left > right, 0 elsewhere.")
-keep_lt = _select("<", "Lanes of `value` where left < right, 0 elsewhere.")
+keep_ge, keep_gt, keep_lt = map(_keep, (">=", ">", "<"))
+"""Keep the lanes of a third value where the first is >=, > or < the second; others become 0."""
 
 
-def _pick(condition: str, doc: str) -> Any:
-    def pick(typingctx, left, right):
-        if not (isinstance(left, LanesType) and left == right):
-            return None
-
-        return left(left, right), lambda context, builder, sig, args: _chosen(builder, condition, *args)
-
-    pick.__doc__ = doc
-    return intrinsic(pick)
+def _smaller(builder, left, right):
+    return builder.select(builder.fcmp_ordered("<", left, right), left, right)
 
 
-def _chosen(builder: ir.IRBuilder, condition: str, left: ir.Value, right: ir.Value) -> ir.Value:
-    return builder.select(builder.fcmp_ordered(condition, left, right), left, right)
+def _larger(builder, left, right):
+    return builder.select(builder.fcmp_ordered(">", left, right), left, right)
 
 
-smaller = _pick("<", "Lane-wise minimum.")
-larger = _pick(">", "Lane-wise maximum.")
+smaller, larger = map(operation(_first), (_smaller, _larger))
+"""Lane-wise minimum and maximum."""
 
 
-@_operation(types.boolean, LANES, LANES)
+@operation(types.boolean, LANES, LANES)
 def any_ge(builder, left, right):
     """Return whether left >= right in any lane."""
     mask = builder.bitcast(builder.fcmp_ordered(">=", left, right), ir.IntType(WIDTH))
     return builder.icmp_unsigned("!=", mask, ir.Constant(ir.IntType(WIDTH), 0))
 
 
-@_operation(types.int64, LANES, LANES)
+@operation(types.int64, LANES, LANES)
 def bits_ge(builder, left, right):
     """Return a bit mask in which bit k is 0 if left < right in lane k, else 1 (also if either is NaN)."""
     mask = builder.bitcast(builder.fcmp_unordered(">=", left, right), ir.IntType(WIDTH))
     return builder.zext(mask, ir.IntType(64))
 
 
-@intrinsic
-def prefetch(typingctx, array, index):
+@operation(types.void)
+def prefetch(builder, array, index):
     """Start loading the cache line of an array element; the index may be outside the array."""
-
-    def codegen(context, builder, sig, args):
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        byte = ir.IntType(8).as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [byte, _INT, _INT, _INT])
-        fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        address = builder.bitcast(builder.gep(data, [args[1]]), byte)
-        builder.call(fetch, [address, *(ir.Constant(_INT, flag) for flag in (0, 3, 1))])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp), codegen
+    byte = ir.IntType(8).as_pointer()
+    kind = ir.FunctionType(ir.VoidType(), [byte, _INT, _INT, _INT])
+    fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+    address = address_of(builder, array, index, ir.IntType(8))
+    builder.call(fetch, [address, *(ir.Constant(_INT, flag) for flag in (0, 3, 1))])
 
 
-@intrinsic
-def column_bits(typingctx, words, index, bit):
+@operation(types.int64)
+def column_bits(builder, words, index, bit):
     """Collect bit `bit` of words[index + k] as bit k of the result, for 64 words of a flat uint16 array."""
-    count = 64
-
-    def codegen(context, builder, sig, args):
-        kind = ir.VectorType(ir.IntType(16), count)
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        held = builder.load(builder.bitcast(builder.gep(data, [args[1]]), kind.as_pointer()), align=2)
-        one = builder.shl(ir.Constant(ir.IntType(16), 1), builder.trunc(args[2], ir.IntType(16)))
-        tested = builder.and_(held, splat(builder, one, count))
-        mask = builder.icmp_unsigned("!=", tested, ir.Constant(kind, None))
-        return builder.bitcast(mask, ir.IntType(count))
-
-    return types.int64(words, types.intp, types.intp), codegen
+    count, word = 64, ir.IntType(16)
+    kind = ir.VectorType(word, count)
+    held = builder.load(address_of(builder, words, index, kind), align=2)
+    one = builder.shl(ir.Constant(word, 1), builder.trunc(bit, word))
+    tested = builder.and_(held, splat(builder, one, count))
+    return builder.bitcast(builder.icmp_unsigned("!=", tested, ir.Constant(kind, None)), ir.IntType(count))
 
 
-@_operation(types.int64, types.int64)
+@operation(types.int64, types.int64)
 def first_bit(builder, bits):
     """Return the index of the lowest set bit; `bits` must not be 0."""
     return builder.cttz(bits, ir.Constant(ir.IntType(1), 1))
 
 
-@intrinsic
-def store_sums(typingctx, array, index, vectors):
-    """Store the lane sums of up to 16 vectors (a tuple) at consecutive indices.
+@operation(types.void)
+def store_sums(builder, array, index, vectors):
+    """Store the lane sums of 2 to 16 vectors (a tuple) at consecutive indices.
 
     Each step merges pairs of vectors and halves the number of lanes per partial sum. This takes half as many
     instructions as a `lane_sum` of each vector.
     """
-    if not isinstance(vectors, types.UniTuple) or vectors.dtype != LANES or not 2 <= len(vectors) <= WIDTH:
-        return None
-    count = len(vectors)
-
-    def codegen(context, builder, sig, args):
-        nothing = ir.Constant(_VECTOR, ir.Undefined)
-        # each vector, with the number of the input vector that each lane belongs to
-        held = [(cgutils.unpack_tuple(builder, args[2])[k], [k] * WIDTH) for k in range(count)]
-        width = WIDTH
-        while width > 1:
-            width //= 2
-            low = [g * 2 * width + k for g in range(WIDTH // (2 * width)) for k in range(width)]
-            high = [lane + width for lane in low]
-            merged = []
-            for k in range(0, len(held), 2):
-                one, ones = held[k]
-                other, others = held[k + 1] if k + 1 < len(held) else (nothing, [-1] * WIDTH)
-                parts = [
-                    builder.shuffle_vector(
-                        one, other, ir.Constant(_INTS, [*take, *(lane + WIDTH for lane in take)])
-                    )
-                    for take in (low, high)
-                ]
-                merged.append((builder.fadd(*parts), [*(ones[i] for i in low), *(others[i] for i in low)]))
-            held = merged
-        total, owner = held[0]
-        order = [owner.index(k) if k < count else 0 for k in range(WIDTH)]
-        total = builder.shuffle_vector(total, nothing, ir.Constant(_INTS, order))
-        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], LANES)
-        bits = ir.VectorType(ir.IntType(1), WIDTH)
-        mask = ir.Constant(bits, [ir.Constant(bits.element, int(k < count)) for k in range(WIDTH)])
-        kind = ir.FunctionType(ir.VoidType(), [_VECTOR, _VECTOR.as_pointer(), _INT, bits])
-        write = cgutils.get_or_insert_function(builder.module, kind, _MASKED_STORE)
-        builder.call(write, [total, pointer, ir.Constant(_INT, 4), mask])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, vectors), codegen
+    count, nothing = vectors.type.count, ir.Constant(_VECTOR, ir.Undefined)
+    # each vector, with the number of the input vector that each lane belongs to
+    held = [(builder.extract_value(vectors, k), [k] * WIDTH) for k in range(count)]
+    width = WIDTH
+    while width > 1:
+        width //= 2
+        low = [g * 2 * width + k for g in range(WIDTH // (2 * width)) for k in range(width)]
+        high = [lane + width for lane in low]
+        merged = []
+        for k in range(0, len(held), 2):
+            one, ones = held[k]
+            other, others = held[k + 1] if k + 1 < len(held) else (nothing, [-1] * WIDTH)
+            parts = [
+                builder.shuffle_vector(
+                    one, other, ir.Constant(_INTS, [*take, *(lane + WIDTH for lane in take)])
+                )
+                for take in (low, high)
+            ]
+            merged.append((builder.fadd(*parts), [*(ones[i] for i in low), *(others[i] for i in low)]))
+        held = merged
+    total, owner = held[0]
+    order = [owner.index(k) if k < count else 0 for k in range(WIDTH)]
+    total = builder.shuffle_vector(total, nothing, ir.Constant(_INTS, order))
+    bits = ir.VectorType(ir.IntType(1), WIDTH)
+    mask = ir.Constant(bits, [ir.Constant(bits.element, int(k < count)) for k in range(WIDTH)])
+    kind = ir.FunctionType(ir.VoidType(), [_VECTOR, _VECTOR.as_pointer(), _INT, bits])
+    write = cgutils.get_or_insert_function(builder.module, kind, _MASKED_STORE)
+    builder.call(write, [total, address_of(builder, array, index, _VECTOR), ir.Constant(_INT, 4), mask])
 
 
 def _halved(builder: ir.IRBuilder, vector: ir.Value, combine: Any) -> ir.Value:
@@ -412,45 +372,41 @@ def _halved(builder: ir.IRBuilder, vector: ir.Value, combine: Any) -> ir.Value:
     return builder.extract_element(vector, ir.Constant(_INT, 0))
 
 
-@_operation(types.float32, LANES)
+@operation(types.float32, LANES)
 def lane_sum(builder, value):
     return _halved(builder, value, builder.fadd)
 
 
-@_operation(types.float32, LANES)
+@operation(types.float32, LANES)
 def lane_max(builder, value):
-    return _halved(builder, value, lambda low, high: _chosen(builder, ">", low, high))
+    return _halved(builder, value, functools.partial(_larger, builder))
 
 
-@intrinsic
-def transpose(typingctx, source, source_index, source_step, target, target_index, target_step):
+@operation(types.void)
+def transpose(builder, source, source_index, source_step, target, target_index, target_step):
     """Transpose a 16 x 16 block while copying it between flat float32 arrays.
 
     Each array is followed by the index of the block's first element and the step between rows.
     """
 
-    def codegen(context, builder, sig, args):
-        def place(array, index, step, row):
-            row_index = builder.add(args[index], builder.mul(args[step], ir.Constant(args[step].type, row)))
-            return _pointer(context, builder, sig.args[array], args[array], row_index, LANES)
+    def addresses(array: ir.Value, index: ir.Value, step: ir.Value) -> list[ir.Value]:
+        starts = [builder.add(index, builder.mul(step, ir.Constant(step.type, row))) for row in range(WIDTH)]
+        return [address_of(builder, array, start, _VECTOR) for start in starts]
 
-        rows = [builder.load(place(0, 1, 2, r), align=4) for r in range(WIDTH)]
-        for bit in (1, 2, 4, 8):  # exchange the off-diagonal blocks of each size
-            for r in range(WIDTH):
-                if not r & bit:
-                    one, other = rows[r], rows[r | bit]
-                    low = [k if not k & bit else WIDTH + (k ^ bit) for k in range(WIDTH)]
-                    high = [k | bit if not k & bit else WIDTH + k for k in range(WIDTH)]
-                    rows[r] = builder.shuffle_vector(one, other, ir.Constant(_INTS, low))
-                    rows[r | bit] = builder.shuffle_vector(one, other, ir.Constant(_INTS, high))
+    rows = [builder.load(address, align=4) for address in addresses(source, source_index, source_step)]
+    for bit in (1, 2, 4, 8):  # exchange the off-diagonal blocks of each size
         for r in range(WIDTH):
-            builder.store(rows[r], place(3, 4, 5, r), align=4)
-        return context.get_dummy_value()
+            if not r & bit:
+                one, other = rows[r], rows[r | bit]
+                low = [k if not k & bit else WIDTH + (k ^ bit) for k in range(WIDTH)]
+                high = [k | bit if not k & bit else WIDTH + k for k in range(WIDTH)]
+                rows[r] = builder.shuffle_vector(one, other, ir.Constant(_INTS, low))
+                rows[r | bit] = builder.shuffle_vector(one, other, ir.Constant(_INTS, high))
+    for row, address in zip(rows, addresses(target, target_index, target_step), strict=True):
+        builder.store(row, address, align=4)
 
-    return types.void(source, types.intp, types.intp, target, types.intp, types.intp), codegen
 
-
-@_operation(LANES, LANES)
+@operation(LANES, LANES)
 def reciprocal(builder, value):
     """Compute 1 / x in every lane, for positive normal numbers, with a relative error below 3e-7.
 
@@ -465,13 +421,9 @@ def reciprocal(builder, value):
     return result
 
 
-@intrinsic
-def root(typingctx, value):
+@operation(_first)
+def root(builder, value):
     """Compute the square root of every lane."""
-
-    def codegen(context, builder, sig, args):
-        kind = ir.FunctionType(value.vector, [value.vector])
-        name = f"llvm.sqrt.v{WIDTH}f{value.dtype.bitwidth}"
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), args)
-
-    return value(value), codegen
+    kind = ir.FunctionType(value.type, [value.type])
+    name = f"llvm.sqrt.v{WIDTH}f{32 if value.type == _VECTOR else 64}"
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [value])

@@ -36,7 +36,7 @@ LOW_PASS_PX2 = 0.3  # default variance added to the projected covariance, px^2 (
 MIN_ALPHA = 1.0 / 255.0  # smaller alphas are not drawn (3DGS, gsplat: 1 / 255)
 MAX_LOG_SCALE = np.float32(20.0)
 """Scales are clipped at exp(20), 5e8 scene units; clipped scales get no gradient. A Gaussian that wide covers
-any view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers.
+any view evenly along that axis; `_exp` is limited to exp(22).
 The limit is float32, because a float64 limit would make the scales float64 and change their last bits."""
 _LEAST_LOG = np.float32(-60.0)
 LOG2_E, LN_2 = 1.4426950408889634, 0.6931471805599453
@@ -377,10 +377,11 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
             # also false if the peak is below MIN_ALPHA, where the half-widths are NaN
             if not (x + half_x > 0.0 and x - half_x < width and y + half_y > 0.0 and y - half_y < height):
                 continue
-            first_x = max(math.ceil(x - half_x - 0.5), 0)
-            last_x = min(math.floor(x + half_x - 0.5), width - 1)
-            first_y = max(math.ceil(y - half_y - 0.5), 0)
-            last_y = min(math.floor(y + half_y - 0.5), height - 1)
+            # clipped first, because huge numbers would overflow as integers
+            first_x = math.ceil(max(x - half_x - 0.5, 0.0))
+            last_x = math.floor(min(x + half_x - 0.5, width - 1.0))
+            first_y = math.ceil(max(y - half_y - 0.5, 0.0))
+            last_y = math.floor(min(y + half_y - 0.5, height - 1.0))
             if last_x < first_x or last_y < first_y:
                 continue
             box[i, 0], box[i, 1], box[i, 2], box[i, 3] = first_x, last_x, first_y, last_y

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hilsplat.scene.scene import Scene
     from hilsplat.segment.masks import HierarchicalMasks
     from hilsplat.splat.gaussians import Gaussians
-    from hilsplat.splat.rasterise.rendering import Rendering, render
+    from hilsplat.splat.rasterise.api import Rendering, render
     from hilsplat.viewer.app import show
 
 __all__ = [
@@ -77,7 +77,7 @@ _NAMES = {
     "hilsplat.scene.scene": ("Scene",),
     "hilsplat.segment.masks": ("HierarchicalMasks",),
     "hilsplat.splat.gaussians": ("Gaussians",),
-    "hilsplat.splat.rasterise.rendering": ("Rendering", "render"),
+    "hilsplat.splat.rasterise.api": ("Rendering", "render"),
     "hilsplat.viewer.app": ("show",),
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names}

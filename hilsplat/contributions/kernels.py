@@ -16,7 +16,7 @@ BLOCK = 2**15
 
 
 @compiled
-def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, indices, data, num_gaussians):
+def summed_masks(first, last, runs, offsets, level_of, labels, half, indptr, indices, data, num_gaussians):
     """Sum weights over masks first..last, and count the summed pixels.
 
     Args:
@@ -35,7 +35,7 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
     columns, values = np.empty(1024, np.int32), np.empty((1024, 3))
     done = 0
     for m in range(first, last):
-        count, pixel, level = 0, np.int64(0), level_index[m]
+        count, pixel, level = 0, np.int64(0), level_of[m] - 1
         for run in range(offsets[m], offsets[m + 1]):
             begin, pixel = pixel, pixel + np.int64(runs[run])
             if (run - offsets[m]) % 2 == 0:
@@ -97,7 +97,7 @@ def transpose(indptr, indices, begins, cells):
 
 @compiled
 def enlarged(indices, values, count, room):
-    """Return larger copies of both arrays with their first `kept` entries."""
+    """Return larger copies of both arrays with their first `count` entries."""
     more_indices = np.empty(room, np.int32)
     more_values = np.empty((room, values.shape[1]), np.float64)
     more_indices[:count], more_values[:count] = indices[:count], values[:count]
@@ -281,9 +281,9 @@ def weights_product(level, last, first, across, indptr, indices, data, valid, fe
 
 
 @compiled
-def mask_means(first, last, indptr, indices, data, level_index, features, out):
+def mask_means(first, last, indptr, indices, data, level_of, features, out):
     for m in range(first, last):
-        level = level_index[m]
+        level = level_of[m] - 1
         for k in range(indptr[m], indptr[m + 1]):
             g, weight = indices[k], data[k]
             for c in range(out.shape[1]):
@@ -291,7 +291,7 @@ def mask_means(first, last, indptr, indices, data, level_index, features, out):
 
 
 @compiled
-def wide_mask_means(first, last, indptr, indices, data, level_index, features, width, out):
+def wide_mask_means(first, last, indptr, indices, data, level_of, features, width, out):
     """Compute `mask_means` for flat features and `out`, with `width` channels per row."""
     num_gaussians = len(features) // (3 * width)
     at = indptr[first:last].copy()
@@ -300,7 +300,7 @@ def wide_mask_means(first, last, indptr, indices, data, level_index, features, w
             some = at[m - first]
             stop = at[m - first] = columns_below(begin + BLOCK, some, indptr[m + 1], indices)
             for c in range(0, width if some < stop else 0, WIDTH):
-                mean = level_index[m] * width + c
+                mean = (level_of[m] - 1) * width + c
                 total = load(out, m * width + c)
                 for k in range(some, stop):
                     there = np.int64(indices[k]) * 3 * width + mean
@@ -309,9 +309,9 @@ def wide_mask_means(first, last, indptr, indices, data, level_index, features, w
 
 
 @compiled
-def spread_rows(begin, end, indptr, indices, data, level_index, values, width, out):
+def spread_rows(begin, end, indptr, indices, data, level_of, values, width, out):
     """Add columns begin..end of A' x to `out`; values and `out` are flat, with `width` channels per row."""
-    masks = len(level_index)
+    masks = len(level_of)
     at = np.empty(masks, np.int64)
     for m in range(masks):
         at[m] = indptr[m] + np.searchsorted(indices[indptr[m] : indptr[m + 1]], begin)
@@ -320,7 +320,7 @@ def spread_rows(begin, end, indptr, indices, data, level_index, values, width, o
             some = at[m]
             stop = at[m] = columns_below(min(block + BLOCK, end), some, indptr[m + 1], indices)
             for c in range(0, width if some < stop else 0, WIDTH):
-                mean = level_index[m] * width + c
+                mean = (level_of[m] - 1) * width + c
                 value = load(values, m * width + c)
                 for k in range(some, stop):
                     there = np.int64(indices[k]) * 3 * width + mean

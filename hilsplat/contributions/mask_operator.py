@@ -3,11 +3,11 @@
 Products of float32 rows use vectors of sixteen channels and are bit-identical to loops over the channels.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Float32, Int64, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from cpusplat.lanes import WIDTH
 from cpusplat.threads import over_edges
@@ -23,26 +23,21 @@ class MaskOperator:
     """Products with A for all levels: from Gaussian features to mask means, and back.
 
     A (CSR; rows are masks, with sorted columns) is used in place, for example memory-mapped. The order
-    of sums does not depend on the number of threads. `level_index` is each mask's level, from 0.
+    of sums does not depend on the number of threads. `level` is each mask's level.
     """
 
     A: sp.csr_matrix
-    level_index: Int64[np.ndarray, " M"]
+    level: UInt8[np.ndarray, " M"]
     threads: int = 1
-
-    @staticmethod
-    def of(A: sp.csr_matrix, level: UInt8[np.ndarray, " M"], threads: int = 1) -> "MaskOperator":
-        """Build the operator from A (M x N) and the level of each row."""
-        return MaskOperator(A, level.astype(np.int64) - 1, threads)
 
     def block(self, begin: int, end: int) -> "MaskOperator":
         if end - begin == self.A.shape[1]:
             return self
-        return MaskOperator(self.A[:, begin:end], self.level_index, self.threads)
+        return replace(self, A=self.A[:, begin:end])
 
     def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
         """Return A F: the mean rendered feature of each mask at its level."""
-        out = np.zeros((len(self.level_index), features.shape[2]), features.dtype)
+        out = np.zeros((len(self.level), features.shape[2]), features.dtype)
         features, A = np.ascontiguousarray(features), self._arrays()
         shares = np.searchsorted(A[0], np.linspace(0, A[0][-1], self.threads + 1)[1:-1])
         edges = [0, *shares.tolist(), len(out)]
@@ -66,7 +61,7 @@ class MaskOperator:
         return np.ascontiguousarray(out[:, :, : values.shape[1]])
 
     def _arrays(self) -> tuple[np.ndarray, ...]:
-        return self.A.indptr, self.A.indices, self.A.data, self.level_index
+        return self.A.indptr, self.A.indices, self.A.data, self.level
 
 
 def lifted_average(

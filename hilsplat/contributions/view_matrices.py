@@ -44,7 +44,7 @@ def view_contributions(
     shares = np.linspace(0, total_px[-1], max(1, threads) + 1)[1:-1]
     edges = [0, *np.searchsorted(total_px, shares).tolist(), len(masks)]
     pixels = label_maps(masks), random_half(view, weights.shape[0])
-    runs = masks.runs, masks.offsets, masks.level.astype(np.int64) - 1
+    runs = masks.runs, masks.offsets, masks.level
     W = weights.indptr, weights.indices, weights.data, weights.shape[1]
     parts = over_edges(summed_masks, edges, threads, *runs, *pixels, *W)
     counts, sizes, columns, sums = (np.concatenate(part) for part in zip(*parts, strict=True))

@@ -112,7 +112,7 @@ def field_losses(
 ) -> tuple[QuadraticProblem, Contrast]:
     """Return the losses of a scene's field; `start` and `seed` are as in `QuadraticProblem.of`."""
     masks, half_masks = (
-        MaskOperator.of(contributions.matrix(name), contributions.level, threads) for name in ("A", "A_half")
+        MaskOperator(contributions.matrix(name), contributions.level, threads) for name in ("A", "A_half")
     )
     pixels = contributions.pixels.astype(np.float32)
     half_pixels = contributions.half_pixels.astype(np.float32)

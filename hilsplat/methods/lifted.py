@@ -15,7 +15,7 @@ from hilsplat.methods.method import MethodInputs
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Lift all levels, without training or randomness."""
     contributions = inputs.contributions
-    masks = MaskOperator.of(contributions.matrix("A"), contributions.level)
+    masks = MaskOperator(contributions.matrix("A"), contributions.level)
     pixels = contributions.pixels.astype(np.float32)
     mass = masks.spread(pixels[:, None])[:, :, 0]
     return lifted_average(masks, mass, pixels, inputs.latents)

@@ -80,7 +80,7 @@ class MethodInputs:
 
     def seen(self) -> Bool[np.ndarray, "N 3"]:
         """Return whether each Gaussian is visible in any mask of each level."""
-        masks = MaskOperator.of(self.contributions.matrix("A"), self.contributions.level)
+        masks = MaskOperator(self.contributions.matrix("A"), self.contributions.level)
         return masks.spread(np.ones((len(self.latents), 1), np.float32))[:, :, 0] > 0
 
     def linear_code(self, method: str) -> LinearCode:

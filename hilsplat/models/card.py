@@ -13,6 +13,7 @@ from jaxtyping import Int64
 
 from hilsplat.base.cards import cards, has_driver, release_card
 from hilsplat.base.errors import DeviceError, MemoryLimitError, first_line
+from hilsplat.base.memory import MIB
 
 logger = logging.getLogger(__name__)
 
@@ -20,7 +21,6 @@ Result = TypeVar("Result")
 
 CPU = "cpu"  # device on which onnxruntime runs a network; on any other, such as `cuda`, torch does
 USED_SHARE = 0.8  # share of the free memory of a card that a call may take, because memory is fragmented
-MIB = 2**20
 TURN = RLock()  # held during a call on a card, so that threads share its memory one after the other
 
 

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from hilsplat.base.errors import ModelError, foreign
 from hilsplat.base.memory import MIB, available_mib
 from hilsplat.models.folder import ModelFolder, input_side_px
 from hilsplat.models.layouts import LAYOUTS
@@ -64,23 +65,28 @@ def needs_of(
         batch: prompts (SAM) or crops (CLIP) per call.
         as_exported: as in `SamModel`.
         num_bytes: size of the networks; None for the size of the folder's files.
+
+    Raises:
+        ModelError: the configuration does not contain numbers.
     """
     if num_bytes is None:
         described = {model.folder / name for name in LAYOUTS[model.layout].described}
         num_bytes = sum(path.stat().st_size for path in model.files if path not in described)
     side, weights = input_side_px(model), 1.2 * num_bytes / MIB
     vision = model.config.get("vision_config", model.config.get("vision_cfg"))
-    if not isinstance(vision, dict):
-        image, as_exported = side * side * UNKNOWN_BYTES_PER_PX / MIB, True
-    elif model.kind == "clip":
-        image = 2 * _attention_mib(vision, side) + CLIP_TOKEN_MIB * (side / _patch_px(vision)) ** 2
-    elif model.layout == "sam" and not as_exported:
-        patches = side / _patch_px(vision)
-        features = patches**2 * vision.get("hidden_size", 768) * 4 / MIB
-        image = ACTIVATIONS * features + ATTENTION_COPIES * _attention_mib(vision, side) / patches
-    else:
-        heads = SAM2_HEADS if model.layout == "sam2" else SAM_HEADS
-        image = ATTENTION_COPIES * _attention_mib(vision, side, heads)
+    fix = "correct it, or fetch a complete copy of the model"
+    with foreign(f"{model.folder / 'config.json'}: vision_config", ModelError, fix=fix):
+        if not isinstance(vision, dict):
+            image, as_exported = side * side * UNKNOWN_BYTES_PER_PX / MIB, True
+        elif model.kind == "clip":
+            image = 2 * _attention_mib(vision, side) + CLIP_TOKEN_MIB * (side / _patch_px(vision)) ** 2
+        elif model.layout == "sam" and not as_exported:
+            patches = side / _patch_px(vision)
+            features = patches**2 * vision.get("hidden_size", 768) * 4 / MIB
+            image = ACTIVATIONS * features + ATTENTION_COPIES * _attention_mib(vision, side) / patches
+        else:
+            heads = SAM2_HEADS if model.layout == "sam2" else SAM_HEADS
+            image = ATTENTION_COPIES * _attention_mib(vision, side, heads)
     if model.kind == "clip":
         return Needs(weights, batch * image)
     decoder = batch * PROMPT_MIB if as_exported else FACTORED_MIB

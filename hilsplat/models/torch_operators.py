@@ -177,8 +177,9 @@ def _gather(x: Tensor, indices: Tensor, *, axis: int = 0) -> Tensor:
 
 def _one_hot(indices: Tensor, depth: int | list[int], values: Tensor, *, axis: int = -1) -> Tensor:
     number = depth[0] if isinstance(depth, list) else depth
-    rows = torch.arange(number, device=indices.device)
-    return torch.where(indices.unsqueeze(-1) % number == rows, values[1], values[0]).movedim(-1, axis)
+    rows, places = torch.arange(number, device=indices.device), indices.unsqueeze(-1)
+    is_hot = (places == rows) | (places + number == rows)
+    return torch.where(is_hot, values[1], values[0]).movedim(-1, axis)
 
 
 def _constant_of_shape(shape: Ints, *, value: Tensor | None = None) -> Tensor:
@@ -276,7 +277,7 @@ OPERATORS: dict[str, Function] = {
     "Resize": _resize,
     "ScatterElements": lambda x, indices, updates, *, axis=0: x.scatter(axis, indices, updates),
     "ScatterND": lambda x, indices, updates: x.index_put(indices.unbind(-1), updates),
-    "Shape": lambda x, start=0, end=None: torch.tensor(x.shape[start:end]),
+    "Shape": lambda x, start=0, end=None: torch.tensor(x.shape[start:end], dtype=torch.int64),
     "Sigmoid": torch.sigmoid,
     "Sin": torch.sin,
     "Size": lambda x: torch.tensor(x.numel()),

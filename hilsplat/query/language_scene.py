@@ -34,7 +34,7 @@ from hilsplat.semantic_tree.tree import OrientedBox, SemanticTree
 from hilsplat.settings import EvaluateSettings
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
-from hilsplat.splat.rasterise.rendering import Rendering, render
+from hilsplat.splat.rasterise.api import Rendering, render
 
 logger = logging.getLogger(__name__)
 

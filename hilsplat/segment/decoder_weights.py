@@ -92,11 +92,9 @@ class DecoderGraph:
         """Return a linear layer from the constants of its MatMul and Add nodes."""
         product = self._node(f"{module}/MatMul")
         total = self._readers.get(product.output[0])
-        weight = self._constants(product)
-        bias = self._constants(total) if total is not None and total.op_type == "Add" else []
-        if len(weight) != 1 or len(bias) != 1:
-            raise _unusual(f"{module} has no constant weights")
-        return Linear(np.ascontiguousarray(weight[0].T), bias[0])
+        adds = [total] if total is not None and total.op_type == "Add" else []
+        weight, bias = self._weights(module, 2, product, *adds)
+        return Linear(np.ascontiguousarray(weight.T), bias)
 
     def attention(self, module: str) -> Attention:
         out = "out" if self._find(f"{module}/out_proj/MatMul") is not None else "o"  # SAM, SAM 2
@@ -113,24 +111,20 @@ class DecoderGraph:
         """Return a layer norm, which is one node since opset 17, or several nodes."""
         node = self._find(f"{module}/LayerNormalization")
         if node is not None:
-            eps = [entry.f for entry in node.attribute if entry.name == "epsilon"] or [DEFAULT_EPS]
-            values = [*self._constants(node), np.array(eps[0])]
-        else:
-            names = [f"{module}/{name}" for name in ("Mul", "Add_1", "Add")]
-            values = [value for name in names for value in self._constants(self._node(name))]
-        if len(values) != 3 or np.size(values[2]) != 1:
-            raise _unusual(f"{module} has no constant weights")
-        return Norm(values[0].reshape(-1), values[1].reshape(-1), values[2].item())
+            scale, shift = self._weights(module, 2, node)
+            eps = next((entry.f for entry in node.attribute if entry.name == "epsilon"), DEFAULT_EPS)
+            return Norm(scale, shift, eps)
+        nodes = [self._node(f"{module}/{name}") for name in ("Mul", "Add_1", "Add")]
+        scale, shift, addend = self._weights(module, 3, *nodes)
+        return Norm(scale.reshape(-1), shift.reshape(-1), addend.item())
 
     def upscaling(self, module: str) -> tuple[Float32[np.ndarray, "i o 2 2"], Float32[np.ndarray, " o"]]:
         """Return weights and bias of a transposed convolution."""
-        values = self._constants(self._node(f"{module}/ConvTranspose"))
-        if len(values) != 2:
-            raise _unusual(f"{module} has no constant weights")
-        return values[0], values[1]
+        weight, bias = self._weights(module, 2, self._node(f"{module}/ConvTranspose"))
+        return weight, bias
 
-    def has(self, module: str, operator: str) -> bool:
-        return any(f"{module}/" in name and node.op_type == operator for name, node in self._nodes.items())
+    def has_sigmoid(self, module: str) -> bool:
+        return any(f"{module}/" in name and node.op_type == "Sigmoid" for name, node in self._nodes.items())
 
     def until(self, *modules: str) -> Graph:
         """Return the subgraph whose outputs are the inputs of the given modules."""
@@ -145,8 +139,13 @@ class DecoderGraph:
             raise _unusual(f"it has no node {ending}")
         return node
 
-    def _constants(self, node: Any) -> list[np.ndarray]:
-        return [value for name in node.input if (value := self._constant(name)) is not None]
+    def _weights(self, module: str, number: int, *nodes: Any) -> list[np.ndarray]:
+        """Return the constant inputs of a module's nodes; there must be `number` in total."""
+        names = [name for node in nodes for name in node.input]
+        values = [value for name in names if (value := self._constant(name)) is not None]
+        if len(values) != number:
+            raise _unusual(f"{module} has no constant weights")
+        return values
 
     def _constant(self, name: str) -> np.ndarray | None:
         """Return a weight, or None for a value that depends on an input; axes of length 1 may be missing."""

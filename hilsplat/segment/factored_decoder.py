@@ -79,7 +79,7 @@ class FactoredDecoder:
         self._updates = [graph.attention(f"{layer}/cross_attn_image_to_token") for layer in layers]
         self._last_norm = graph.norm(f"{base}/layer_norm_final_attn")
         self._iou_head = graph.perceptron("mask_decoder/iou_prediction_head")
-        self._iou_sigmoid = graph.has("mask_decoder/iou_prediction_head", "Sigmoid")
+        self._iou_sigmoid = graph.has_sigmoid("mask_decoder/iou_prediction_head")
         self._mask_heads = [
             graph.perceptron(f"mask_decoder/output_hypernetworks_mlps.{k}") for k in (1, 2, 3)
         ]

@@ -7,6 +7,7 @@ LangSplat's suppression. `generator: official` runs each step as published (diff
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -139,27 +140,23 @@ def decode_candidates(
     grid = sam.point_grid(settings.points_per_side)
     thresholds = model.thresholds(settings)
     batch = model.prompts_per_call(thresholds.points_per_batch, len(grid))
-    parts = list[Candidates]()
-    for crop, (left, top, right, bottom) in enumerate(boxes):
+
+    def of_crop(crop: int) -> Iterator[Candidates]:
+        left, top, right, bottom = boxes[crop]
         encoded = model.encode(np.ascontiguousarray(image[top:bottom, left:right]))
         on_grid = grid * (right - left, bottom - top)
         prompts: sam.Prompts = {"points": on_grid if points is None or crop else points}
         if uses_preview(model, settings):
             prompts = distinct_prompts(encoded, prompts, model, settings, batch)
 
-        def decoded(
-            rows: Int64[np.ndarray, " b"],
-            number: int,
-            encoded: sam.Encoded = encoded,
-            prompts: sam.Prompts = prompts,
-            crop: int = crop,
-        ) -> Candidates:
+        def decoded(rows: Int64[np.ndarray, " b"], number: int) -> Candidates:
             called = {name: rows_of[rows] for name, rows_of in prompts.items()}
             scores, logits = (values[:number] for values in model.finish(encoded, called))
             return keep_candidates(scores, logits, encoded.frame, crop, settings, thresholds)
 
-        parts += model.batches("masks", batch)(len(next(iter(prompts.values()))), decoded)
-    return Candidates.concatenate(parts)
+        return model.batches("masks", batch)(len(next(iter(prompts.values()))), decoded)
+
+    return Candidates.concatenate([part for crop in range(len(boxes)) for part in of_crop(crop)])
 
 
 def uses_preview(model: sam.SamModel, settings: MasksSettings) -> bool:
@@ -259,9 +256,9 @@ def edge_windows(
     reach = np.array([-BAND_PX, -BAND_PX, BAND_PX, BAND_PX], np.int32)
     windows = np.clip(boxes[rows] + reach, 0, np.array([width, height, width, height], np.int32))
     if not isinstance(logits, np.ndarray):
-        from hilsplat.segment import torch_masks
+        from hilsplat.segment import torch_decoder
 
-        values = torch_masks.windows(logits, rows, windows, BAND_PX)
+        values = torch_decoder.windows(logits, rows, windows, BAND_PX)
         sizes = (windows[:, 2:] - windows[:, :2]).prod(axis=1, dtype=np.int64)
         return values, np.concatenate([[0], np.cumsum(sizes)]), windows
     square = np.ones((2 * BAND_PX + 1, 2 * BAND_PX + 1), np.uint8)

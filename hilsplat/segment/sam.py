@@ -8,7 +8,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal
 
@@ -116,11 +116,7 @@ class SamModel:
         if self.factored is None and device != CPU:
             self.decoder = DecoderNetwork(model, DECODER, device)
         for decoder in filter(None, (self.decoder, self.previewer)):
-            in_turn(
-                device,
-                "masks",
-                lambda of=decoder: of.require_repeatable(features, self.padded_hw[0]),  # type: ignore[misc]
-            )
+            in_turn(device, "masks", partial(decoder.require_repeatable, features, self.padded_hw[0]))
         self.as_exported = device == CPU and (
             self.factored is None or (self._graph is None and not self.stretches)
         )
@@ -177,14 +173,14 @@ class SamModel:
 
         if self.stretches or not isinstance(vision, dict) or self.device != CPU:
             return open_as(None)
-        layers = vision.get("global_attn_indexes", (2, 5, 8, 11))
-        heads = vision.get("num_attention_heads", 12)
-        side = vision.get("image_size", 1024) // vision.get("patch_size", 16)
+
+        def rowwise() -> tuple[Graph | None, Network]:
+            side = vision.get("image_size", 1024) // vision.get("patch_size", 16)
+            layers = vision.get("global_attn_indexes", (2, 5, 8, 11))
+            return open_as(with_rowwise_attention(path, layers, vision.get("num_attention_heads", 12), side))
+
         cost = "each image takes about 5 times as much memory"
-        rowwise = or_as_exported(
-            path, cost, lambda: open_as(with_rowwise_attention(path, layers, heads, side))
-        )
-        return rowwise or open_as(None)
+        return or_as_exported(path, cost, rowwise) or open_as(None)
 
     def _random_features(self) -> dict[str, np.ndarray]:
         """Return random image features; the encoder runs only if no network declares their shapes."""
@@ -394,9 +390,9 @@ def read_logits(
     # an integer exceeds x if and only if it exceeds floor(x)
     upper, lower = math.floor(offset / LOGIT_STEP), math.floor(-offset / LOGIT_STEP)
     if not isinstance(logits, np.ndarray):
-        from hilsplat.segment import torch_masks
+        from hilsplat.segment import torch_decoder
 
-        on_card, areas = torch_masks.steps_and_areas(logits, LOGIT_STEP, (upper, lower), (height, width))
+        on_card, areas = torch_decoder.steps_and_areas(logits, LOGIT_STEP, (upper, lower), (height, width))
         return on_card, (areas[0] / np.maximum(areas[1], 1)).astype(np.float32), positive_boxes(on_card)
     steps, stability = np.empty(logits.shape, np.int8), np.empty(len(logits), np.float32)
     for row, values in enumerate(logits):  # one by one, in the processor's cache
@@ -409,9 +405,9 @@ def read_logits(
 def positive_boxes(logits: Real[Array, "K h w"]) -> Int32[np.ndarray, "K 4"]:
     """Return the box (xyxy, end exclusive) of the positive logits of each mask, all 0 if there are none."""
     if not isinstance(logits, np.ndarray):
-        from hilsplat.segment import torch_masks
+        from hilsplat.segment import torch_decoder
 
-        return torch_masks.positive_boxes(logits)
+        return torch_decoder.positive_boxes(logits)
     boxes = np.empty((len(logits), 4), np.int32)
     for row, values in enumerate(logits):
         x, y, width, height = cv2.boundingRect((values > 0).view(np.uint8))

@@ -1,7 +1,7 @@
 """Suppression of masks that repeat a better mask; first boxes are compared, then pixels."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int64
+from jaxtyping import Bool, Float, Int, Int64, Real
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks
@@ -45,12 +45,12 @@ def suppress_boxes(
     area = np.prod(boxes_xyxy[:, 2:] - boxes_xyxy[:, :2], axis=1, dtype=np.int64)
     ranks = [] if first is None else [-first]
     order = np.lexsort((*boxes_xyxy.T[::-1], -area, -score, *ranks))
-    return np.sort(order[_greedy(boxes_xyxy[order], iou_max)])
+    return np.sort(order[distinct_boxes(boxes_xyxy[order], -np.arange(len(order)), iou_max)])
 
 
 def distinct_boxes(
     boxes_xyxy: Int[np.ndarray, "M 4"],
-    score: Float[np.ndarray, " M"],
+    score: Real[np.ndarray, " M"],
     iou_max: float,
     stability: Float[np.ndarray, " M"] | None = None,
     slack: float = 0.0,
@@ -65,19 +65,8 @@ def distinct_boxes(
     """
     order = np.argsort(-score, kind="stable")
     boxes = boxes_xyxy[order]
-    return order[_greedy(boxes, iou_max, None if stability is None else stability[order], slack)]
-
-
-def _greedy(
-    boxes: Int[np.ndarray, "M 4"],
-    iou_max: float,
-    stability: Float[np.ndarray, " M"] | None = None,
-    slack: float = 0.0,
-) -> Bool[np.ndarray, " M"]:
-    """Return which boxes are kept if each kept box drops later ones whose IoU with it exceeds `iou_max`.
-
-    If stabilities are given, only boxes with a stability at most `slack` above the kept box's are dropped.
-    """
+    if stability is not None:
+        stability = stability[order]
     alive = np.ones(len(boxes), dtype=bool)
     for start in range(0, len(boxes), BOXES_AT_ONCE):
         block = np.flatnonzero(alive[start : start + BOXES_AT_ONCE]) + start
@@ -87,7 +76,7 @@ def _greedy(
         for row, is_allowed in zip(block, allowed, strict=True):
             if alive[row]:
                 alive[row + 1 :] &= is_allowed[row + 1 - start :]
-    return alive
+    return order[alive]
 
 
 def keep_best_masks(

@@ -11,14 +11,6 @@ MAX_READS = 2  # a cluster's neighbours are read this many times before those th
 
 
 @compiled
-def _unpack(view, indptr, indices, data, out, fill):
-    """Write a view's values to their columns of `out`, or zeros if `fill` is false; no view if negative."""
-    if view >= 0:
-        for k in range(indptr[view], indptr[view + 1]):
-            out[indices[k]] = data[k] if fill else 0.0
-
-
-@compiled
 def add_views(mass, pair_view, pair_row, order, matrix, out):
     """Add to the entries of row `pair_row` their Gaussians' mass in view `pair_view`, pair by pair.
 
@@ -30,9 +22,10 @@ def add_views(mass, pair_view, pair_row, order, matrix, out):
     current = -1
     for pair in order:
         if pair_view[pair] != current:
-            _unpack(current, mass_indptr, mass_indices, mass_data, unpacked, False)
             current = pair_view[pair]
-            _unpack(current, mass_indptr, mass_indices, mass_data, unpacked, True)
+            unpacked[:] = 0.0
+            for k in range(mass_indptr[current], mass_indptr[current + 1]):
+                unpacked[mass_indices[k]] = mass_data[k]
         row = pair_row[pair]
         for k in range(indptr[row], indptr[row + 1]):
             out[k] += unpacked[indices[k]]
@@ -104,7 +97,7 @@ def seen_sizes(begin, end, masks, visible, pairs, out, out_views, full):
 
 @compiled
 def _more_pairs(firsts, seconds, sums, count, room):
-    """Return larger copies of three arrays with their first `kept` entries."""
+    """Return larger copies of three arrays with their first `count` entries."""
     more = np.empty(room, np.int32)
     more[:count] = firsts[:count]
     return more, *enlarged(seconds, sums, count, room)

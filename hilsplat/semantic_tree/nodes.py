@@ -12,9 +12,8 @@ from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.base.memory import MIB, limit_mib, require_memory
 from hilsplat.contributions.compositing import column_sums
-from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
 from hilsplat.semantic_tree.kernels import add_views, divide_by_unions
-from hilsplat.semantic_tree.linkage import pooled_linkage
+from hilsplat.semantic_tree.linkage import Evidence, mask_evidence, pooled_linkage
 from hilsplat.semantic_tree.view_pairs import ViewPairs, view_pairs
 from hilsplat.settings import SemanticTreeSettings
 
@@ -394,16 +393,11 @@ def nest_nodes(
         members = np.flatnonzero(child >= 0)
         members = members[parent[child[members]] != NONE]
         above = parent[child[members]]
-        holds = nested[members, index_of[above]]
-        grand = np.where(parent[above] != NONE, parent[above], NONE)
-        held_above = np.where(grand != NONE, nested[members, index_of[np.maximum(grand, 0)]], NONE)
-        fits_above = (grand == NONE) | (held_above == grand) | (held_above == NONE)
-        joins = (holds == NONE) & fits_above
-        leaves = (holds != above) & ~joins
-        nested[members[joins], index_of[above[joins]]] = above[joins]
-        joins_grand = joins & (grand != NONE)
-        nested[members[joins_grand], index_of[grand[joins_grand]]] = grand[joins_grand]
-        nested[members[leaves], child_level.index] = NONE
+        ancestors = np.stack([above, np.where(parent[above] != NONE, parent[above], above)])
+        held = nested[members, index_of[ancestors]]
+        fits = ((held == ancestors) | (held == NONE)).all(axis=0)
+        nested[members[fits], index_of[ancestors[:, fits]]] = ancestors[:, fits]
+        nested[members[~fits], child_level.index] = NONE
     return nested
 
 

@@ -39,6 +39,7 @@ CURVE_EVERY = 20  # number of steps between two points on the training curve
 MIN_SIDE_PX = 64  # minimum length of a downscaled image's shorter side
 MAX_SHOWN = 8  # maximum number of views on the contact sheet of test views
 ERROR_GAIN = 4  # factor by which displayed errors are multiplied
+MAX_PSNR_DB = 120.0  # PSNR of a view without error, because JSON has no infinity
 
 MEMORY_USER = "the fit of the Gaussians"
 MEMORY_FIX = (
@@ -101,7 +102,8 @@ def fit_step(state: FitState, views: list[TrainingView], settings: GaussiansSett
     scores = model.step(view, settings, extent, StepOptions(degree, background, rate, is_watched))
     if model.steps % CURVE_EVERY == 0:
         loss, error = scores()
-        state.curve.append([model.steps, loss, -10 * np.log10(max(error, 1e-12)), len(model)])
+        psnr_db = -10 * np.log10(max(error, 10 ** (-MAX_PSNR_DB / 10)))
+        state.curve.append([model.steps, loss, psnr_db, len(model)])
     if not is_frozen:
         control_density(model, settings, rate, extent, state.generator)
 
@@ -161,15 +163,17 @@ def fit_gaussians(
             sizes[scale] = load_views(scene, "train", scale * settings.image_scale)
         fit_step(state, sizes[scale], settings, extent)
         if len(model) == 0:
-            raise SceneError(
-                f"all Gaussians of {scene.name} became transparent",
-                fix="check the poses (registration.png), or lower gaussians.min_opacity",
-            )
+            break
         if checkpoint and (step + 1) % settings.checkpoint_every == 0 and step + 1 < settings.iterations:
             state.save(checkpoint)
     if settings.initial != "frozen":
         prune(model, settings, extent)
         model.select(morton_order(model.read("means")))
+    if len(model) == 0:
+        raise SceneError(
+            f"all Gaussians of {scene.name} became transparent",
+            fix="check the poses (registration.png), or lower gaussians.min_opacity",
+        )
     if checkpoint:
         delete(checkpoint, r"[0-9a-f]{16}\.npz")
     return model.as_gaussians(), np.array(state.curve).reshape(-1, 4)
@@ -209,25 +213,26 @@ def write_report(
     background = (float(settings.background == "white"),) * 3
 
     def picture(camera: Camera, threads: int = threads) -> UInt8[np.ndarray, "H W 3"]:
-        color = render(gaussians, camera, background=background, threads=threads)
+        color = render(gaussians, camera, background=background, threads=threads).colours
         return np.round(color.clip(0, 1) * 255).astype(np.uint8)
 
     test, train = (load_views(scene, split, settings.image_scale) for split in ("test", "train"))
     views, split = (test, "test") if test else (train, "train")
     scores: dict[str, dict[str, float]] = {}
-    flat: list[float] = []
+    gains: list[float] = []  # over a flat colour in dB, of each view that has more than one colour
     cells: list[UInt8[np.ndarray, "_ _ 3"]] = []
     titles: list[str] = []
     for view in views:
         rendering = picture(view.camera)  # scored as a saved 8-bit image
         values, truth = to_float(rendering), to_float(view.image)
-        scores[view.camera.name] = {"psnr_db": psnr(values, truth), "ssim": ssim(values, truth)}
-        flat.append(psnr(np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape), truth))
+        psnr_db = min(psnr(values, truth), MAX_PSNR_DB)
+        scores[view.camera.name] = {"psnr_db": psnr_db, "ssim": ssim(values, truth)}
+        if np.ptp(view.image, axis=(0, 1)).any():
+            gains.append(psnr_db - psnr(np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape), truth))
         if len(cells) < 3 * MAX_SHOWN:
             error = np.abs(view.image.astype(np.int32) - rendering) * ERROR_GAIN
             cells += [view.image, rendering, np.minimum(error, 255).astype(np.uint8)]
-            quality = f"fit, {scores[view.camera.name]['psnr_db']:.1f} dB"
-            titles += [view.camera.name, quality, f"error x {ERROR_GAIN}"]
+            titles += [view.camera.name, f"fit, {psnr_db:.1f} dB", f"error x {ERROR_GAIN}"]
     report: dict[str, Any] = {
         "split": split,
         **{name: float(np.mean([score[name] for score in scores.values()])) for name in ("psnr_db", "ssim")},
@@ -237,7 +242,7 @@ def write_report(
         "warnings": [],
         "views": scores,
     }
-    if report["psnr_db"] <= np.mean(flat):
+    if gains and np.mean(gains) <= 0:
         report["warnings"].append(
             f"the {split} views score {report['psnr_db']:.1f} dB, no better than a single flat colour: check "
             "test_views.png; the Gaussians and the cameras may use different coordinates, or the poses "

@@ -95,11 +95,9 @@ def _camera(row: Float64[np.ndarray, " 9"], like: Camera) -> Camera:
 def short_round(distances: Float64[np.ndarray, "S S"]) -> list[int]:
     """Return a short closed tour, built from nearest neighbours and then improved by 2-opt."""
     number = len(distances)
-    tour, left = [0], set(range(1, number))
-    while left:
-        nearest = min(sorted(left), key=lambda stop: distances[tour[-1], stop])
-        tour.append(nearest)
-        left.remove(nearest)
+    tour = [0]
+    while len(tour) < number:
+        tour.append(int(np.where(np.isin(range(number), tour), np.inf, distances[tour[-1]]).argmin()))
     improved = number > 3
     while improved:
         improved = False
@@ -121,13 +119,13 @@ def write_flyaround(
     Frames are rendered while earlier ones are encoded; the bytes do not depend on the number of threads.
     """
     rendered = in_order(picture, closed_path(cameras, FRAMES), threads)
-    film = encoded_film(folder / "flyaround.mp4", rendered, FRAMES_PER_S)
+    film = encoded_film(folder / "flyaround.mp4", rendered)
     samples = [frame for number, frame in enumerate(film) if number % (FRAMES // SHEET_FRAMES) == 0]
     write_png(folder / "flyaround.png", contact_sheet(samples, columns=4))
 
 
 def encoded_film(
-    path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int
+    path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]]
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     """Encode one or more frames of the same size as MP4, and yield each frame once it is encoded.
 
@@ -141,7 +139,7 @@ def encoded_film(
     first = next(frames)
     height, width = (side // 2 * 2 for side in first.shape[:2])
     with av.open(path, "w", format="mp4", options={"movflags": "faststart", "fflags": "bitexact"}) as film:
-        stream = film.add_stream("libx264", rate=per_second, options=OPTIONS)
+        stream = film.add_stream("libx264", rate=FRAMES_PER_S, options=OPTIONS)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.codec_context.flags |= av.codec.context.Flags.bitexact
         for frame in chain([first], frames):

@@ -22,7 +22,7 @@ from hilsplat.splat.initial import TrainingView
 from hilsplat.splat.kernels import MIN_GATE, NOISE_SHARPNESS
 from hilsplat.splat.model import SH_REST_SHARE, Model, Scores, StepOptions, is_regularised, step_sizes
 from hilsplat.splat.rasterise import cuda
-from hilsplat.splat.rasterise.drawn import refuse_broken
+from hilsplat.splat.rasterise.api import refuse_broken
 
 try:
     from fused_ssim import fused_ssim  # the same value in one kernel

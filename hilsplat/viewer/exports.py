@@ -82,7 +82,7 @@ def film(
     pictures = (painted(gaussians, camera, paint, threads) for camera in used)
     with TemporaryDirectory() as folder:
         out = Path(folder) / f"film.{kind}"
-        encoded = encoded_film(out, pictures, FRAMES_PER_S) if kind == "mp4" else encoded_gif(out, pictures)
+        encoded = encoded_film(out, pictures) if kind == "mp4" else encoded_gif(out, pictures)
         for done, _ in enumerate(encoded, 1):
             yield done, len(used)
         return out.read_bytes()

@@ -23,7 +23,7 @@ def psnr(found: np.ndarray, expected: np.ndarray) -> float:
 
 def rendered(gaussians: Gaussians, page) -> np.ndarray:
     camera = WireCamera.model_validate(page.wire_camera()).camera()
-    return to_uint8(render(gaussians, camera))
+    return to_uint8(render(gaussians, camera).colours)
 
 
 def test_webgl_equals_the_pipeline_on_the_same_bytes(opened, cloud, cloud_address):

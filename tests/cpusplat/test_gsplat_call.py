@@ -54,6 +54,14 @@ def test_opacities_and_scales_may_have_their_extreme_values(opacity, scale):
     assert alphas[0, 12, 16, 0] == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.parametrize(("depth", "scale"), [(1e-22, 1.0), (1e-17, 1.0), (2.0, 1e9)])
+def test_a_gaussian_that_is_far_wider_than_the_view_covers_it(depth, scale):
+    huge = one_gaussian(means=[[0, 0, depth]], scales=[3 * [scale]])
+    _, alphas, meta = rasterization(**huge, near_plane=0.0)
+    np.testing.assert_allclose(alphas, 0.8, rtol=1e-6)
+    assert (meta["radii"] == 2**31 - 1).all()
+
+
 def test_near_far_and_low_pass_are_honoured():
     assert rasterization(**one_gaussian(), near_plane=2.1)[1].max() == 0
     assert rasterization(**one_gaussian(), far_plane=1.9)[1].max() == 0

@@ -52,7 +52,7 @@ def reference(gaussians: dict, cameras: dict, mode: str, sh_degree: int | None, 
 def test_images_and_gradients_agree_with_gsplats_reference(mode, colours):
     rng, n = np.random.default_rng(1), 60
     arrays, cameras = random_gaussians(n, seed=3), two_cameras()
-    sh_degree = 2 if colours == "harmonics" else None
+    sh_degree = {"RGB": 1, "RGB+D": 2}.get(mode, 3) if colours == "harmonics" else None
     if colours == "of each view":
         arrays["colors"] = rng.normal(size=(2, n, 4)).astype(np.float32)
     elif colours == "harmonics":

@@ -28,8 +28,7 @@ from hilsplat.segment.digests import digest_of, digests_in, load_masks
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import GaussiansSettings, MasksSettings
 from hilsplat.splat.ply import save_ply
-from hilsplat.splat.rasterise.api import pixel_weights
-from hilsplat.splat.rasterise.api import render as render_rgb
+from hilsplat.splat.rasterise.api import draw, pixel_weights
 from hilsplat.splat.steps import fit_steps
 from tests.unit.finished_desk import SCENE
 
@@ -151,19 +150,20 @@ def test_a_rendering_has_colours_depth_features_and_alpha(linked):
     gaussians, camera = linked.gaussians, linked.camera("001.png")
     features = np.random.default_rng(0).normal(size=(len(gaussians), 5)).astype(np.float32)
     found = hilsplat.render(gaussians, camera, features, background=(1.0, 0.5, 0.0), threads=1)
-    expected = render_rgb(gaussians, camera, background=(1.0, 0.5, 0.0))
+    seen = draw(gaussians, camera, gaussians.sh_degree)
+    expected = seen.image + (1 - seen.alpha)[..., None] * np.float32([1, 0.5, 0])
     np.testing.assert_array_equal(found.colours, expected)
     weights = pixel_weights(gaussians, camera, min_weight=0.0)
     height, width = camera.size_hw
     blended = (weights @ features).reshape(height, width, 5)
     np.testing.assert_allclose(found.features, blended, atol=1e-5)
     np.testing.assert_allclose(found.alpha, np.asarray(weights.sum(axis=1)).reshape(height, width), atol=1e-5)
-    seen = found.alpha > 0
-    np.testing.assert_allclose(found.depth[seen], 30.0, atol=1e-3)  # all Gaussians are in one plane
-    assert np.isnan(found.depth[~seen]).all()
+    covered = found.alpha > 0
+    np.testing.assert_allclose(found.depth[covered], 30.0, atol=1e-3)  # all Gaussians are in one plane
+    assert np.isnan(found.depth[~covered]).all()
     plain = linked.render("001.png")
     assert plain.features.shape == (height, width, 0)
-    np.testing.assert_array_equal(plain.colours, render_rgb(gaussians, camera))
+    np.testing.assert_array_equal(plain.colours, seen.image)
 
 
 def export_colmap(desk, out):

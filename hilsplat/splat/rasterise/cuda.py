@@ -16,7 +16,7 @@ from cpusplat.blend import MAX_ALPHA
 from cpusplat.project import LOW_PASS_PX2, NEAR
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
-from hilsplat.splat.rasterise.drawn import refuse_broken, weight_matrix
+from hilsplat.splat.rasterise.api import refuse_broken, weight_matrix
 
 DEVICE = "cuda"  # tests set this to `cpu` and use gsplat's reference implementation in torch
 TILE = 16  # side of a gsplat tile, px

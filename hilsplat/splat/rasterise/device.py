@@ -14,7 +14,8 @@ from typing import Literal
 from hilsplat.base.cache import forget, remembered
 from hilsplat.base.cards import has_driver, release_card
 from hilsplat.base.errors import DeviceError, first_line
-from hilsplat.models.card import MIB, free_mib, is_out_of_memory
+from hilsplat.base.memory import MIB
+from hilsplat.models.card import free_mib, is_out_of_memory
 
 logger = logging.getLogger(__name__)
 

@@ -17,11 +17,11 @@ from tests.unit.two_boxes_world import NUM_GAUSSIANS, two_boxes_weights
 def test_products_have_the_bytes_of_plain_loops_on_any_number_of_threads(channels, threads):
     num_gaussians, rng = 2 * BLOCK + 5, np.random.default_rng(2)
     A = sp.random(14, num_gaussians, 0.002, random_state=rng, dtype=np.float32, format="csr")
-    operator = MaskOperator.of(A, rng.integers(1, 4, 14).astype(np.uint8), threads)
+    operator = MaskOperator(A, rng.integers(1, 4, 14).astype(np.uint8), threads)
     features = rng.normal(size=(num_gaussians, 3, channels)).astype(np.float32)
     values = rng.normal(size=(14, channels)).astype(np.float32)
     means, spread = np.zeros_like(values), np.zeros_like(features)
-    for mask, level in enumerate(operator.level_index):
+    for mask, level in enumerate(operator.level - 1):
         for k in range(A.indptr[mask], A.indptr[mask + 1]):
             gaussian, weight = A.indices[k], A.data[k]
             means[mask] += weight * features[gaussian, level]

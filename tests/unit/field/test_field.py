@@ -63,7 +63,7 @@ class Toy:
         self.A_half = (sp.diags(1 / self.half_pixels) @ self.half @ self.W).astype(np.float32)
         self.latents = rng.normal(size=(9, CHANNELS)).astype(np.float32)
         self.problem = QuadraticProblem.of(
-            MaskOperator.of(sp.csr_matrix(self.A), self.level),
+            MaskOperator(sp.csr_matrix(self.A), self.level),
             StackedWeights(sp.csr_matrix(self.W), self.labels >= 0),
             self.pixels,
             self.latents,
@@ -78,7 +78,7 @@ class Toy:
             self.level.astype(np.int64),
             tuple((np.arange(begin, begin + 3), PARENT[begin:][:3].astype(np.int64)) for begin in (3, 6)),
         )
-        half = MaskOperator.of(sp.csr_matrix(self.A_half), self.level)
+        half = MaskOperator(sp.csr_matrix(self.A_half), self.level)
         return Contrast(self.problem.masks, half, self.pixels, self.half_pixels, [relations], settings)
 
     def terms(self, settings: HiLSplatSettings) -> HierarchyTerms:

@@ -47,8 +47,9 @@ def test_the_estimates_for_vit_b_agree_with_the_measurements(tmp_path):
     assert needs_of(folder(tmp_path, "open_clip", resnet, 224), batch=64) == clip
 
 
-@pytest.mark.parametrize(("megabytes", "auto"), [(400, True), (1300, False)])
-def test_int8_of_a_large_network_is_used_only_if_it_is_required(tmp_path, megabytes, auto):
+@pytest.mark.parametrize(("megabytes", "auto"), [(1, True), (2, False)])
+def test_int8_of_a_large_network_is_used_only_if_it_is_required(tmp_path, monkeypatch, megabytes, auto):
+    monkeypatch.setattr("hilsplat.models.int8.LARGE_BYTES", 1_500_000)
     model = folder(tmp_path, "sam", {}, 1024, megabytes)
     assert reduced_precision("auto", model, "vision_encoder") == ("int8" if auto else "")
     assert reduced_precision("int8", model, "vision_encoder") == "int8"

@@ -52,7 +52,9 @@ GRAPHS = [
     "n = NonZero (tiles) s2 = Shape (n) z = Cast <to = 1> (s2) t = ReduceSum (z) y = Mul (x, t)",
     f"c = Equal (two, two) d = Squeeze (c) y = If <{BRANCHES}> (d)",
     "o = OneHot <axis = 1> (minus, four, zero_one) p = ReduceSum (o) y = Add (x, p)",
+    "o = OneHot (index, four, zero_one) p = ReduceSum (o) y = Add (x, p)",  # 4 is out of range
     "i = ScatterElements <axis = 3> (x, index, updates) y = Add (i, x)",
+    "a = Shape (three) b = Concat <axis = 0> (a, tiles) y = Tile (x, b)",  # a number has no axes
     "d = ScatterND (x, at, rows3) g = GatherND (d, at) r = ReduceSum (g) y = Add (d, r)",
     "y = DepthToSpace <blocksize = 2, mode = 'CRD'> (four_deep)",
     "y = GridSample <padding_mode = 'border'> (x, grid)",

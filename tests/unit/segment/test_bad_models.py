@@ -52,6 +52,11 @@ def as_torch(folder: Path) -> None:
         (written(CONFIG, SAM | {"mask_generation": {"stability_min": 3}}), "mask_generation is invalid"),
         (written(CONFIG, SAM | {"mask_generation": {"segmenter": "graph"}}), "mask_generation is invalid"),
         (written(CONFIG, SAM | {"mask_generation": [1]}), "mask_generation is invalid"),
+        (
+            written(CONFIG, SAM | {"vision_config": {"num_attention_heads": "12"}}),
+            "vision_config cannot be re",
+        ),
+        (written(CONFIG, SAM | {"vision_config": {"backbone_config": 3}}), "vision_config cannot be read"),
         (written(PREPROCESSOR, {"do_normalize": False}), "disables do_normalize"),
         (written(PREPROCESSOR, {"image_std": [0, 1, 1]}), "image_std is invalid"),
     ],
@@ -60,6 +65,13 @@ def test_incomplete_damaged_and_unsupported_folders_are_refused(own_sam, change,
     change(own_sam)
     with pytest.raises(ModelError, match=words):
         SamModel.load(own_sam)
+
+
+@pytest.mark.parametrize("vision", [{"patch_size": 0}, {"image_size": "1024"}, {"global_attn_indexes": 3}])
+def test_an_encoder_that_differs_from_its_configuration_runs_as_exported(own_sam, caplog, vision):
+    written(CONFIG, SAM | {"vision_config": vision})(own_sam)
+    assert SamModel.load(own_sam).as_exported
+    assert "vision_encoder.onnx runs as exported" in caplog.text
 
 
 SPEC = NetworkSpec({"x": (None, None)}, {"y": (None, 3)})

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from hilsplat.semantic_tree.evidence import Evidence, MaskPairs, mask_evidence
-from hilsplat.semantic_tree.linkage import pooled_linkage
+from hilsplat.semantic_tree.linkage import Evidence, MaskPairs, mask_evidence, pooled_linkage
 from hilsplat.semantic_tree.view_pairs import view_pairs
 
 

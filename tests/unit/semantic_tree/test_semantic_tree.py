@@ -11,7 +11,7 @@ from hilsplat.base.errors import MemoryLimitError, MisalignedArtifactError
 from hilsplat.base.lineage import sha256_of_path
 from hilsplat.semantic_tree import nodes
 from hilsplat.semantic_tree.build import run_semantic_tree
-from hilsplat.semantic_tree.evidence import mask_evidence
+from hilsplat.semantic_tree.linkage import mask_evidence
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.semantic_tree.view_pairs import ViewPairs, view_pairs
 from hilsplat.settings import SemanticTreeSettings

@@ -5,7 +5,7 @@ import pytest
 import scipy.sparse as sp
 
 from hilsplat.semantic_tree import view_pairs as module
-from hilsplat.semantic_tree.evidence import mask_evidence
+from hilsplat.semantic_tree.linkage import mask_evidence
 from hilsplat.semantic_tree.view_pairs import view_pairs
 
 VIEWS = 40

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from hilsplat.scene.cameras import Camera
@@ -51,8 +50,3 @@ def round_gaussian(opacity: float, scale: float, depth: float) -> Gaussians:
 def rows(gaussians: Gaussians, chosen: slice | np.ndarray) -> Gaussians:
     """Some of the Gaussians."""
     return Gaussians(*(getattr(gaussians, name)[chosen] for name in FIELDS))
-
-
-def leaves(gaussians: Gaussians) -> list[torch.Tensor]:
-    """The parameters as float64 tensors that gather gradients."""
-    return [torch.from_numpy(getattr(gaussians, name).astype(np.float64)).requires_grad_() for name in FIELDS]

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from hilsplat.base.artifacts import read_json, write_json
 from hilsplat.base.errors import ArtifactError, HilsplatError, SceneError
+from hilsplat.base.images import write_png
 from hilsplat.scene.assemble import move_cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.export import write_selection_ply
@@ -30,9 +31,9 @@ def test_a_rendered_view_is_unchanged_under_a_similarity(degree):
     similarity = np.eye(4)
     similarity[:3, :3] = 0.37 * Rotation.random(rng=np.random.default_rng(7)).as_matrix()
     similarity[:3, 3] = (5.0, -3.0, 2.0)
-    before = render(gaussians, view)
+    before = render(gaussians, view).colours
     moved = replace(view, cam_from_world=move_cameras(view.cam_from_world[None], similarity)[0])
-    after = render(move_gaussians(gaussians, similarity), moved)
+    after = render(move_gaussians(gaussians, similarity), moved).colours
     assert before.mean() > 0.05
     # float32 parameters; a pixel at the cut of 1/255 may fall on either side
     np.testing.assert_allclose(after, before, atol=5e-3)
@@ -105,6 +106,17 @@ def test_gaussians_in_other_coordinates_are_reported(turned_scene, tmp_path):
     save_ply(tmp_path / "elsewhere.ply", three_gaussians())
     out = stage_output(turned_scene, tmp_path / "elsewhere.ply", tmp_path)
     assert "different coordinates" in read_json(out / "report" / "report.json")["warnings"][0]
+
+
+def test_a_view_without_error_has_a_finite_score_and_one_colour_is_no_yardstick(tmp_path):
+    scene = three_gaussians_scene(tmp_path / "scene")
+    scene.cameras.cam_from_world[7, [0, 2]] *= -1  # turn the camera away from the Gaussians
+    write_png(scene.folder / "images/007.png", np.zeros((48, 48, 3), np.uint8))
+    scene.save()
+    save_ply(tmp_path / "truth.ply", three_gaussians())
+    report = stage_output(scene, tmp_path / "truth.ply", tmp_path) / "report/report.json"
+    scores = json.loads(report.read_text(), parse_constant=pytest.fail)
+    assert scores["views"]["007.png"]["psnr_db"] == 120 and scores["warnings"] == []
 
 
 def test_a_ply_of_this_package_is_moved_by_the_json_beside_it(turned_scene, source_ply, out):

@@ -158,21 +158,22 @@ def test_frozen_gaussians_stay_at_their_points(scene, strategy):
 
 
 @pytest.mark.parametrize(
-    ("first_x", "num_points", "split", "message"),
+    ("first_x", "num_points", "split", "changes", "message"),
     [
-        (np.nan, 8, "train", "gaussians.initial: frozen"),
-        (0.0, 0, "train", "gaussians.initial: frozen"),
-        (0.0, 8, "test", "no training view"),
+        (np.nan, 8, "train", {"initial": "frozen"}, "gaussians.initial: frozen"),
+        (0.0, 0, "train", {"initial": "frozen"}, "gaussians.initial: frozen"),
+        (0.0, 8, "test", {}, "no training view"),
+        (0.0, 8, "train", {"iterations": 1, "min_opacity": 0.2}, "all Gaussians of toy/three became transp"),
     ],
-    ids=["not finite", "no points", "all held out"],
+    ids=["not finite", "no points", "all held out", "all pruned at the end"],
 )
-def test_a_scene_that_cannot_be_fitted_is_refused(scene, first_x, num_points, split, message):
+def test_a_scene_that_cannot_be_fitted_is_refused(scene, first_x, num_points, split, changes, message):
     xyz = scene.points_xyz.copy()
     xyz[0, 0] = first_x
     points = {"points_xyz": xyz[:num_points], "points_rgb": scene.points_rgb[:num_points]}
     bare = replace(scene, split={**scene.split, **dict.fromkeys(scene.views("train"), split)}, **points)
     with pytest.raises(SceneError, match=message):
-        fit.fit_gaussians(bare, SETTINGS.model_copy(update={"initial": "frozen"}), seed=0)
+        fit.fit_gaussians(bare, SETTINGS.model_copy(update=changes), seed=0)
 
 
 def test_images_grow_from_a_quarter_to_their_size():

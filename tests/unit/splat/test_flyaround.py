@@ -88,14 +88,14 @@ def test_the_film_shows_every_frame_and_the_sheet_every_tenth(tmp_path):
 
 def test_odd_sides_are_cropped_and_equal_frames_give_equal_bytes(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (3, 47, 61, 3), np.uint8)
-    list(flyaround.encoded_film(tmp_path / "a.mp4", noise, 24))
+    list(flyaround.encoded_film(tmp_path / "a.mp4", noise))
     with av.open(tmp_path / "a.mp4") as film:
         assert [frame.to_ndarray(format="rgb24").shape for frame in film.decode(video=0)] == [(46, 60, 3)] * 3
     tile = np.random.default_rng(0).integers(0, 255, (15, 20, 3)).repeat(8, axis=0).repeat(8, axis=1)
     frames = [np.roll(tile, 3 * shift, axis=1).astype(np.uint8) for shift in range(40)]
     written = set()
     for _ in range(8):
-        list(flyaround.encoded_film(tmp_path / "film.mp4", frames, 24))
+        list(flyaround.encoded_film(tmp_path / "film.mp4", frames))
         written.add((tmp_path / "film.mp4").read_bytes())
     assert len(written) == 1
 

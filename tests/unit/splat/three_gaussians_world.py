@@ -38,7 +38,7 @@ def three_gaussians_scene(folder: Path, scene_from_source: np.ndarray | None = N
     """Nine views, two of them held out; eight sparse points."""
     truth, cameras = three_gaussians(), ring(NUM_VIEWS, SIZE_PX)
     for name in cameras.names:
-        color = render(truth, cameras[name]).clip(0, 1)
+        color = render(truth, cameras[name]).colours.clip(0, 1)
         write_png(folder / "images" / name, np.round(color * 255).astype(np.uint8))
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 3)).astype(np.float32)
     split = {name: "test" if row % 4 == 3 else "train" for row, name in enumerate(cameras.names)}
@@ -54,6 +54,6 @@ def mean_psnr(scene: Scene, gaussians: Gaussians) -> float:
     """Mean PSNR of the held-out views, dB."""
     values = []
     for name in scene.views("test"):
-        shown = render(gaussians, scene.cameras[name]).clip(0, 1)
+        shown = render(gaussians, scene.cameras[name]).colours.clip(0, 1)
         values.append(psnr(shown, scene.image(name).astype(np.float32) / 255))
     return float(np.mean(values))

@@ -104,7 +104,7 @@ def test_pictures_picks_and_films_leave_out_removed_gaussians(shown, client, cam
     (tmp_path / "right.ply").write_bytes(
         client.post("/api/export/scene-ply", json={"removed": removed}).content
     )
-    expected = np.rint(255 * np.clip(render(load_ply(tmp_path / "right.ply"), camera), 0, 1))
+    expected = np.rint(255 * np.clip(render(load_ply(tmp_path / "right.ply"), camera).colours, 0, 1))
     np.testing.assert_allclose(frame(client, camera, removed=removed), expected, atol=1)
     pick = {"camera": wire_camera(camera), "x": 8.5, "y": 8.5}
     assert client.post("/api/pick", json=pick).json()["alpha"] > 0.9

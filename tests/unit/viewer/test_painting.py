@@ -16,7 +16,7 @@ from tests.unit.viewer.conftest import table, wire_camera
 
 
 def test_a_frame_without_a_style_equals_the_pipeline(shown, client, camera):
-    expected = to_uint8(render(shown.gaussians, camera))
+    expected = to_uint8(render(shown.gaussians, camera).colours)
     np.testing.assert_array_equal(painted(shown.gaussians, camera), expected)
     sent = client.post("/api/frame", json={"camera": wire_camera(camera), "image": "png"})
     assert sent.headers["content-type"] == "image/png"
@@ -46,7 +46,7 @@ def test_unselected_gaussians_are_unchanged_grey_faint_or_hidden(shown, scene, c
     frame = painted(shown.gaussians, camera, Paint.of(style, nodes, len(scene.tree)))
     chosen = (nodes[:, 0] == whole).astype(np.float32)
     own = draw(shown.gaussians, camera, 0, features=np.stack([chosen, 1 - chosen], axis=1)).image
-    plain = render(shown.gaussians, camera)
+    plain = render(shown.gaussians, camera).colours
     inside, outside = own[..., 3] > 0.95, own[..., 4] > 0.95
     assert inside.any() and outside.any()
     assert np.abs(frame[inside].astype(int) - (0, 255, 0)).max() <= 0.06 * 255
