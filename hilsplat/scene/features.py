@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags
 
-from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.errors import ImageError
 from hilsplat.base.images import (
     exif_tags,
     open_image,
@@ -134,19 +134,11 @@ def prepare_images(
 
 
 def lenses_of(images: Sequence[WorkImage], camera_model: str, single_camera: str) -> list[Lens]:
-    """Group views by lens: by size and EXIF focal length ("auto"), all together ("yes") or singly ("no")."""
+    """Group views by lens: by size and EXIF focal length ("auto"), by size alone ("yes"), or singly ("no")."""
     groups: dict[object, list[WorkImage]] = {}
     for image in images:
         key = {"yes": image.size_hw, "no": image.view}.get(single_camera, (image.size_hw, image.focal_px))
         groups.setdefault(key, []).append(image)
-    if single_camera == "yes" and len(groups) > 1:
-        sizes = sorted({f"{width} x {height}" for (height, width) in (image.size_hw for image in images)})
-        raise SceneError(
-            "poses.single_camera is yes, but the images have several sizes",
-            expected="one size (width x height) for all images",
-            found=", ".join(sizes),
-            fix="set poses.single_camera to auto, or keep only images of one size",
-        )
     lenses: list[Lens] = []
     for group in groups.values():
         (height, width), focal = group[0].size_hw, group[0].focal_px

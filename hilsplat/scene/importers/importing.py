@@ -179,7 +179,8 @@ def misfit_notes(views: Sequence[KnownView], points: Points, what: str) -> list[
         if misfit < MAX_MISFIT * other or not np.ptp(rgb, axis=0).any():
             return []
         problem = "their colours are not those of their pixels"
-    return [f"the {what} don't match the images: {problem}. Are poses and {what} in the same coordinates?"]
+    question = f"Are poses and {what} in the same coordinates, and the colours those of the photographs?"
+    return [f"the {what} don't match the images: {problem}. {question}"]
 
 
 def _colours_in(
