@@ -256,6 +256,29 @@ def test_a_map_does_not_replace_a_missing_image(maps, tmp_path):
     assert path in [view.image for view in read_source(find_known_poses(named)).views]
 
 
+@pytest.mark.parametrize("kind", ["transforms", "llff"])
+def test_without_the_photographs_their_largest_copies_are_used(kind, tmp_path, imported):
+    folder = write(tmp_path / "in", SQUARE, {**SIZE, "fl_x": FX})
+    if kind == "llff":
+        rows = [[*pose[:3, [1, 0, 2, 3]].T, [HEIGHT, WIDTH, FX]] for pose in POSES.values()]
+        rows = np.array(rows) * np.array([1, 1, -1, 1, 1])[:, None]
+        rows = rows.transpose(0, 2, 1).reshape(6, 15)
+        np.save(folder / "poses_bounds.npy", np.column_stack([rows, np.ones((6, 2))]))
+        (folder / "transforms.json").unlink()
+    (folder / "images").rename(folder / "images_4")
+    sizes = {"images_2": 2, "images_8": 4}
+    for copy, factor in sizes.items():
+        lens = world.pinhole(*[FX / factor] * 2, WIDTH / 2 / factor, HEIGHT / 2 / factor)
+        pictures = {
+            letter: world.picture(lens, WIDTH // factor, HEIGHT // factor, pose) for letter, pose in POSES.items()
+        }
+        world.save(folder / copy, pictures)
+    views, _, _, report = imported(folder)
+    assert {(view.camera.width, view.camera.height) for view in views} == {(WIDTH // 2, HEIGHT // 2)}
+    world.require_right(views, right("abcdef"), 40)
+    assert any(f"the images in {folder}/images_2, which are smaller" in note for note in report["warnings"])
+
+
 def posed(matrix):
     return lambda frame: frame.update(transform_matrix=matrix.tolist())
 

@@ -10,7 +10,7 @@ from hilsplat.base.images import image_size_hw
 from hilsplat.scene.importers.known_views import KnownView, Source, check_centres, read_colmap, read_llff
 from hilsplat.scene.importers.phones import read_polycam, read_record3d
 from hilsplat.scene.importers.transforms import read_transforms
-from hilsplat.scene.layouts import KnownPoses
+from hilsplat.scene.layouts import SCALED, KnownPoses
 
 READERS = {
     "colmap": read_colmap,
@@ -46,6 +46,9 @@ def read_source(known: KnownPoses) -> Source:
         source.unposed = [name for name in others if name not in source.left_out]
     source.notes += check_centres({view.name: view.lens for view in source.views if view.image is not None})
     source.notes += _size_notes(source)
+    for folder in sorted({view.image.parent for view in source.views if view.image is not None}):
+        if SCALED.search(f"{folder}/") and not any(folder.name in view.name for view in source.views):
+            source.notes.append(f"the images in {folder}, which are smaller copies, are used")
     source.notes += [f"{other} also has poses, which are not used" for other in known.others]
     if source.points is not None:
         xyz, rgb = source.points
