@@ -67,8 +67,8 @@ def write_model(
         lens = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
         cameras.append(struct.pack("<IiQQ4d", number, PINHOLE, width, height, *lens))
         numbers = *quaternion_of(pose[:3, :3]), *pose[:3, 3]
-        observations = struct.pack("<Q", 0)
-        poses += [struct.pack("<I7dI", number, *numbers, number), os.fsencode(image.name), b"\0", observations]
+        name_and_observations = os.fsencode(image.name) + bytes(1 + 8)
+        poses.append(struct.pack("<I7dI", number, *numbers, number) + name_and_observations)
     points = np.zeros(len(xyz), POINT)
     points["id"], points["xyz"], points["rgb"], points["error_px"] = 1 + np.arange(len(xyz)), xyz, rgb, -1
     (folder / "cameras.bin").write_bytes(b"".join(cameras))

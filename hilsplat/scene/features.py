@@ -134,7 +134,7 @@ def prepare_images(
 
 
 def lenses_of(images: Sequence[WorkImage], camera_model: str, single_camera: str) -> list[Lens]:
-    """Group views by lens: by size and EXIF focal length ("auto"), by size alone ("yes"), or singly ("no")."""
+    """Group views by lens: by size and EXIF focal length ("auto"), by size ("yes"), or singly ("no")."""
     groups: dict[object, list[WorkImage]] = {}
     for image in images:
         key = {"yes": image.size_hw, "no": image.view}.get(single_camera, (image.size_hw, image.focal_px))

@@ -266,13 +266,10 @@ def test_without_the_photographs_their_largest_copies_are_used(kind, tmp_path, i
         np.save(folder / "poses_bounds.npy", np.column_stack([rows, np.ones((6, 2))]))
         (folder / "transforms.json").unlink()
     (folder / "images").rename(folder / "images_4")
-    sizes = {"images_2": 2, "images_8": 4}
-    for copy, factor in sizes.items():
+    for copy, factor in (("images_2", 2), ("images_8", 4)):
         lens = world.pinhole(*[FX / factor] * 2, WIDTH / 2 / factor, HEIGHT / 2 / factor)
-        pictures = {
-            letter: world.picture(lens, WIDTH // factor, HEIGHT // factor, pose) for letter, pose in POSES.items()
-        }
-        world.save(folder / copy, pictures)
+        size = WIDTH // factor, HEIGHT // factor
+        world.save(folder / copy, {name: world.picture(lens, *size, pose) for name, pose in POSES.items()})
     views, _, _, report = imported(folder)
     assert {(view.camera.width, view.camera.height) for view in views} == {(WIDTH // 2, HEIGHT // 2)}
     world.require_right(views, right("abcdef"), 40)

@@ -140,7 +140,8 @@ def test_photographs_share_a_camera_when_size_and_focal_length_agree(tmp_path):
     guessed = [(["0.png", "2.png"], model, None), (["1.png"], model, None)]
     assert lenses_of(images, model, "auto") == [*guessed, (["3.png"], model, [5.0, 2.0, 1.5])]
     assert [views for views, _, _ in lenses_of(images, model, "no")] == [[f"{row}.png"] for row in range(4)]
-    assert [views for views, _, _ in lenses_of(images, model, "yes")] == [["0.png", "2.png", "3.png"], ["1.png"]]
+    of_sizes = [["0.png", "2.png", "3.png"], ["1.png"]]
+    assert [views for views, _, _ in lenses_of(images, model, "yes")] == of_sizes
 
 
 def found(registered, models):
