@@ -186,7 +186,7 @@ def _from_aggregation(
         groups = list(read_json_object(path, ("segGroups",))["segGroups"])
     for row, group in enumerate(groups):
         with decoding(f"{path}, group {row}", expected="objectId, label and a list of segments"):
-            category, number = str(group["label"]), int(group["objectId"]) + 1
+            category, number = str(group["label"]), np.int32(int(group["objectId"]) + 1)
             members = np.asarray(group["segments"], dtype=np.int64)
         rows = np.isin(segments, members)
         if not rows.any():

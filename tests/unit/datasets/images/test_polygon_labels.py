@@ -144,8 +144,10 @@ def test_a_polygon_that_reaches_outside_the_image_is_clipped_and_reported(tmp_pa
         (thing(segmentation=[]), "segmentation is not a polygon"),
         (thing(segmentation="x"), "segmentation is not a polygon"),
         (thing(segmentation=[[2, 3], [3e9, 3], [9, 9]]), "segmentation is not a polygon"),
+        (thing(segmentation=[[2, 3], [10**400, 3], [9, 9]]), "segmentation is not a polygon"),
         (thing(segmentation=[[30, 2], [35, 2], [35, 4]]), r"\(knife\): a polygon is entirely outside"),
         (thing(bbox=[1, 2, 3]), "invalid bbox"),
+        (thing(bbox=[1, 2, 3, 10**400]), "invalid bbox"),
         (thing(segmentation=[[4, 3], [8, 3], [8, 6]], bbox=[4, 3, 4, 3]), r"bbox is not \[x1, y1, x2, y2\]"),
     ],
 )
