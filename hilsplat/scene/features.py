@@ -122,12 +122,10 @@ def prepare_images(
         size_hw = (pixels.shape[0], pixels.shape[1])
         write_png(folder / view, pixels, WORK_COMPRESSION)
         images.append(WorkImage(view, source, size_hw, exif_focal_px(source, size_hw), exif_time(source)))
-    if damaged and len(images) < min_share * len(sources):
-        if len(damaged) == 1:
-            raise ImageError(*damaged.values())
+    if len(images) < min_share * len(sources):
         raise ImageError(
-            f"{len(damaged)} of {len(sources)} images in {sources[0].parent} cannot be read",
-            found=", ".join(f"{path.name} ({path.stat().st_size} bytes)" for path in damaged),
+            f"{len(damaged)} of {len(sources)} images in {sources[0].parent} cannot be used",
+            found="\n            ".join(" ".join(reason.split()) for reason in damaged.values()),
             fix="remove them from the folder or replace them with intact copies",
         )
     return images, damaged

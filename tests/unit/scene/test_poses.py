@@ -68,7 +68,8 @@ def test_too_few_or_damaged_photographs_are_refused_with_all_names(tmp_path):
     with pytest.raises(ImageError, match=r"empty\.jpg cannot be read"):
         pose_photos(folder, tmp_path / "scene", min_registered_share=0.8)
     (folder / "half.png").write_bytes((folder / "0.png").read_bytes()[:2000])
-    with pytest.raises(ImageError, match=r"2 of 5 images(.|\n)*empty\.jpg \(0 bytes\), half\.png"):
+    (folder / "lost.png").symlink_to("gone.png")
+    with pytest.raises(ImageError, match=r"3 of 6 images(.|\n)*empty\.jpg(.|\n)*half\.png(.|\n)*lost\.png"):
         pose_photos(folder, tmp_path / "scene")
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]  # no scene, no work folder
 
