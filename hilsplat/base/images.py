@@ -74,7 +74,7 @@ def open_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> Image.Image
     if image.format == "TIFF":
         image.filename = ""  # else Pillow 13 maps the file into memory, and scrambles turned pictures
         try:
-            while image.tag_v2.get(ExifTags.Base.NewSubfileType) == 1:  # type: ignore[attr-defined]
+            while image.tell() < 4 and image.tag_v2.get(ExifTags.Base.NewSubfileType) == 1:  # type: ignore
                 image.seek(image.tell() + 1)  # a reduced copy may come first
         except EOFError:
             image.seek(0)
