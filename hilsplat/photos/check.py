@@ -145,7 +145,6 @@ def inspect_photos(folder: Path, posed: Sequence[Path] = ()) -> PhotoReport:
     photos = [*posed] or list_images(photo_folder(folder))
     folder = Path(os.path.commonpath([path.parent for path in photos])) if photos else photo_folder(folder)
     view_names(photos)
-    sizes: Counter[tuple[int, int]] = Counter()
     unreadable: list[tuple[str, str]] = []
     by_digest: dict[str, list[str]] = defaultdict(list)
     num_rotated = 0
@@ -162,7 +161,6 @@ def inspect_photos(folder: Path, posed: Sequence[Path] = ()) -> PhotoReport:
             unreadable.append((name, reason + size))
             continue
         size_hw = (pixels.shape[0], pixels.shape[1])
-        sizes[size_hw] += 1
         with opened_image(path) as image:
             num_rotated += orientation(image) > 1
         is_matched = row in matched and not have_poses
@@ -172,7 +170,7 @@ def inspect_photos(folder: Path, posed: Sequence[Path] = ()) -> PhotoReport:
     distinct = [photo for photo in checked if photo.name not in copies]
     return PhotoReport(
         folder=folder,
-        sizes=dict(sizes),
+        sizes=Counter(photo.size_hw for photo in checked),
         unreadable=tuple(unreadable),
         num_rotated=num_rotated,
         duplicates=tuple(tuple(names) for names in by_digest.values() if len(names) > 1),
