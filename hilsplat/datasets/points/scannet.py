@@ -29,6 +29,7 @@ from hilsplat.datasets.points.labelled_points import (
     read_matrices,
     require_file,
 )
+from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.importers.known_views import NOTED_OFFSET, check_centres
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
 
@@ -93,6 +94,8 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
         info = dict(re.findall("(.*) = (.*)", described.read_text("utf-8"))) if described.is_file() else {}
         if "colorHeight" in info and "colorWidth" in info:
             size_hw = int(info["colorHeight"]), int(info["colorWidth"])
+            if not 0 < min(size_hw) <= max(size_hw) <= MAX_SIDE_PX:
+                raise ValueError(f"its sides are not from 1 to {MAX_SIDE_PX} px")
         else:
             size_hw = image_size_hw(frames[0][1]) if frames else (0, 0)
     for number, path in frames:

@@ -153,7 +153,7 @@ def _text(path: Path, expected: str, record: Callable[[str], Row]) -> list[Row]:
             if any("_" in cell and not cell[0].isalpha() for cell in line.split(maxsplit=9)[:9]):
                 raise ValueError  # Python reads 1_0 as 10
             rows.append(record(line.strip()))
-        except (ValueError, IndexError) as error:
+        except (ArithmeticError, LookupError, ValueError) as error:
             where = f"{path}, line {number}, cannot be read"
             raise SceneError(where, expected=expected, found=repr(line[:80]), fix=FIX) from error
     return rows

@@ -155,6 +155,10 @@ NUMBERLESS = '{"segGroups": [{"label": "wall", "segments": [7]}]}'
         (text_in(GROUPS, '{"segGroups": null}'), r"aggregation\.json cannot be read"),
         (text_in(SEGMENTS, '{"segIndices": [[1], [2, 3]]}'), r"segs\.json cannot be read"),
         (text_in(f"{SCAN}.txt", "colorHeight = a\ncolorWidth = 9\n"), r"\.txt cannot be read.*whole numbers"),
+        (
+            text_in(f"{SCAN}.txt", "colorHeight = 12\ncolorWidth = 0\n"),
+            r"\.txt cannot be read: its sides are not",
+        ),
         (lambda scan: (scan / f"../../{LABEL_TABLE}").write_bytes(b"\xe9"), r"tsv cannot be read: 'utf-8'"),
         (text_in(SEGMENTS, '{"segIndices": [1]}'), r"segs\.json does not match.*each of 5 .*found     1 val"),
         (text_in("pose/0.txt", "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"), "the pose is not a rotation"),
