@@ -115,7 +115,8 @@ def read_views(
     """Read training views (`read_view`); also return why others, whose files cannot be used, are left out.
 
     Raises:
-        ArtifactError: less than `MIN_SHARE` of the views can be used, or two views share their files.
+        ArtifactError: less than `MIN_SHARE` of the views can be used, two views share their files, or vectors
+            differ in width.
     """
     maps, lost = {}, []
     for view in track(stems_of([*cameras]), "LangSplat's files"):
@@ -129,6 +130,10 @@ def read_views(
             found="; ".join(lost[:3]),
             fix="pass the language_features folder that LangSplat wrote for the same images",
         )
+    widths = sorted({vectors.shape[1] for _, vectors in maps.values()})
+    if len(widths) > 1:
+        problem = f"{folder} has vectors of {' and '.join(map(str, widths))} numbers"
+        raise ArtifactError(problem, expected="vectors of one CLIP model", fix="run the preprocessing again")
     return maps, lost
 
 
