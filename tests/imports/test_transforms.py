@@ -203,6 +203,12 @@ def test_the_split_of_the_source_is_kept(lists, held_out, tmp_path):
     assert "".join(view.name[7] for view in source.views if view.is_test) == held_out
 
 
+def test_a_split_without_training_views_is_refused(tmp_path):
+    folder = write(tmp_path, PLAIN, {**NUMBERS, "test_filenames": NAMES})
+    with pytest.raises(SceneError, match=r"transforms\.json holds out all 6 views"):
+        read_source(find_known_poses(folder))
+
+
 def test_the_test_frames_of_scannetpp_are_held_out(tmp_path, imported):
     """They are a second list of frames, not names."""
     folder = write(tmp_path / "in", PLAIN, NUMBERS)

@@ -31,7 +31,7 @@ def read_source(known: KnownPoses) -> Source:
     several files list is used once, as the first describes it. Points that are not finite are dropped.
 
     Raises:
-        SceneError: a file cannot be used, or at least three views all have one pose.
+        SceneError: a file cannot be used, all views are held out, or at least three all have one pose.
     """
     source = READERS[known.kind](known)
     poses = np.array([view.cam_from_source for view in source.views])
@@ -41,6 +41,9 @@ def read_source(known: KnownPoses) -> Source:
         )
     used = {view.image for view in source.views}
     _keep_one_view_per_image(source)
+    if source.views and all(view.is_test for view in source.views):
+        problem = f"{known.files[0]} holds out all {len(source.views)} views for tests"
+        raise SceneError(problem, fix="list fewer views for tests, because others are needed for training")
     if known.kind == "colmap" and (beside := known.root / "images").is_dir():
         others = [path.name for path in list_images(beside) if path not in used]
         source.unposed = [name for name in others if name not in source.left_out]
