@@ -259,7 +259,8 @@ def _to_srgb(image: Image.Image, info: Mapping[Any, Any], file: object) -> Image
         else:
             assert converted is not None  # only in-place conversion returns None
             return converted
-    colours, gamma = image.convert("RGB"), info.get("gamma", 1 / 2.2)
+    colours = image if image.mode == "RGB" else image.convert("RGB")  # which would copy it
+    gamma = info.get("gamma", 1 / 2.2)
     if profile or "srgb" in info or abs(gamma - 1 / 2.2) < 0.01:  # 1 / 2.2 is nearly sRGB
         return colours
     return colours.point(srgb_codes(np.linspace(0, 1, 256) ** (1 / gamma)).tolist() * 3)
