@@ -433,6 +433,12 @@ def test_missing_and_damaged_points_are_refused_by_name(content, tmp_path):
         read_source(find_known_poses(folder))
 
 
+def test_a_header_without_an_end_is_not_searched_for_it(tmp_path):
+    (tmp_path / "a.ply").write_bytes(b"ply\ncomment " + bytes(2**21))
+    with pytest.raises(SceneError, match="not a PLY file with a header of at most 1048576 bytes"):
+        read_ply_points(tmp_path / "a.ply")
+
+
 def test_blender_s_second_file_is_the_test_set_and_the_third_replaces_it(tmp_path, imported):
     for split, letters in (("train", "abcd"), ("val", "e"), ("test", "f")):
         write(tmp_path / "in", SQUARE, {"camera_angle_x": angle(WIDTH, FX)}, letters)
