@@ -286,6 +286,10 @@ def posed(matrix):
     return lambda frame: frame.update(transform_matrix=matrix.tolist())
 
 
+def at(x):
+    return np.block([[np.eye(3), [[x], [0], [0]]], [np.zeros(3), 1]])
+
+
 def changed(folder, change):
     path = folder / "transforms.json"
     content = json.loads(path.read_text())
@@ -345,6 +349,9 @@ def test_views_that_all_have_one_pose_are_refused(tmp_path):
     changed(folder, lambda content: [posed(np.eye(4))(frame) for frame in content["frames"]])
     with pytest.raises(SceneError, match="same pose"):
         read_source(find_known_poses(folder))
+    # Cameras that only move, in coordinates of a map.
+    changed(folder, lambda content: [posed(at(4e6 + row))(content["frames"][row]) for row in range(6)])
+    assert len(read_source(find_known_poses(folder)).views) == 6
 
 
 def test_two_frames_with_one_image_are_both_left_out(tmp_path):

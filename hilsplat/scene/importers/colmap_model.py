@@ -147,7 +147,7 @@ def _text(path: Path, expected: str, record: Callable[[str], Row]) -> list[Row]:
     with foreign(path, fix=FIX):
         text = regular(path).read_text(encoding="utf-8-sig", errors="surrogateescape")
     for number, line in enumerate(text.split("\n"), 1):
-        if line.isspace() or not line or line.startswith("#"):
+        if not line.strip() or line.startswith("#"):
             continue
         try:
             if any("_" in cell and not cell[0].isalpha() for cell in line.split(maxsplit=9)[:9]):

@@ -53,9 +53,8 @@ def import_poses(
     with_image = {view.image: view for view in source.views if view.image is not None}
     posed: list[tuple[KnownView, PosedView]] = []
     turned: list[str] = []
-    for view, view_name in track(
-        [*zip(with_image.values(), view_names([*with_image]), strict=True)], "images read"
-    ):
+    pairs = [*zip(with_image.values(), view_names([*with_image]), strict=True)]
+    for view, view_name in track(pairs, "images read"):
         try:
             distorted = _with_pixels(view, view_name, work / "images", settings.max_side_px, turned)
             posed.append((view, undistort(distorted, work / "pinhole", settings.max_side_px)))

@@ -35,10 +35,9 @@ def read_source(known: KnownPoses) -> Source:
     """
     source = READERS[known.kind](known)
     poses = np.array([view.cam_from_source for view in source.views])
-    if len(poses) > 2 and np.allclose(poses, poses[0]):
-        raise SceneError(
-            f"all {len(poses)} views of {known.files[0]} have the same pose", fix="export it again"
-        )
+    if len(poses) > 2 and (poses == poses[0]).all():
+        problem = f"all {len(poses)} views of {known.files[0]} have the same pose"
+        raise SceneError(problem, fix="export it again")
     used = {view.image for view in source.views}
     _keep_one_view_per_image(source)
     if source.views and all(view.is_test for view in source.views):
@@ -50,7 +49,8 @@ def read_source(known: KnownPoses) -> Source:
     source.notes += check_centres({view.name: view.lens for view in source.views if view.image is not None})
     source.notes += _size_notes(source)
     for folder in sorted({view.image.parent for view in source.views if view.image is not None}):
-        if SCALED.search(f"{folder}/") and not any(folder.name in view.name for view in source.views):
+        inside = f"/{folder.relative_to(known.root).as_posix()}/"
+        if SCALED.search(inside) and not any(folder.name in view.name for view in source.views):
             source.notes.append(f"the images in {folder}, which are smaller copies, are used")
     source.notes += [f"{other} also has poses, which are not used" for other in known.others]
     if source.points is not None:
