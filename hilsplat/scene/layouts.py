@@ -172,8 +172,8 @@ def photo_folder(folder: Path) -> Path:
         return folder
     if export := polycam_folders(folder) or record3d_export(folder):
         return export[0]
-    below = largest_copies(used_images(folder))
-    images = [path for path in below if 2 <= len(path.relative_to(folder).parts) <= 3]
+    candidates = largest_copies(used_images(folder))
+    images = [path for path in candidates if 2 <= len(path.relative_to(folder).parts) <= 3]
     has_one_place = len({path.parent for path in images}) == 1
     return images[0].parent if has_one_place and len(images) > num_images else folder
 

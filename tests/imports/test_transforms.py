@@ -287,7 +287,9 @@ def posed(matrix):
 
 
 def at(x):
-    return np.block([[np.eye(3), [[x], [0], [0]]], [np.zeros(3), 1]])
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
 
 
 def changed(folder, change):
