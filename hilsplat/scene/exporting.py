@@ -30,11 +30,10 @@ def in_source(scene: Scene) -> tuple[list[PosedImage], Float64[np.ndarray, "P 3"
 
 def posed_images(scene: Scene, cam_from_world: Float64[np.ndarray, "V 4 4"]) -> list[PosedImage]:
     """Return the undistorted images of all views, with the given poses and the scene's split."""
-    images = []
-    for name, pose in zip(scene.cameras.names, cam_from_world, strict=True):
-        camera, split = scene.cameras[name], scene.split[name]
-        images.append(PosedImage(name, scene.image_path(name), pose, camera.K, camera.size_hw, split=split))
-    return images
+    return [
+        PosedImage(c.name, scene.image_path(c.name), pose, c.K, c.size_hw, split=scene.split[c.name])
+        for c, pose in zip(scene.cameras, cam_from_world, strict=True)
+    ]
 
 
 def write_colmap(scene: Scene, out: Path) -> None:

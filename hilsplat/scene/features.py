@@ -167,21 +167,16 @@ def find_matches(
     # Import first: extraction would add images as its threads finish, so results would depend on timing.
     names: list[str] = []
     for lens_views, camera_model, params in lenses:
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = camera_model
-        if params is not None:
-            reader.camera_params = ", ".join(map(repr, params))
+        numbers = ", ".join(map(repr, params or ()))
+        reader = pycolmap.ImageReaderOptions(camera_model=camera_model, camera_params=numbers)
         pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, lens_views, reader)
         names += lens_views
-    options = pycolmap.FeatureExtractionOptions()
-    options.num_threads = threads
-    options.use_gpu = False
-    options.max_image_size = settings.max_side_px
+    size = settings.max_side_px
+    options = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False, max_image_size=size)
     options.sift.max_num_features = settings.max_features
     options.sift.peak_threshold = PEAK_THRESHOLD
     pycolmap.extract_features(database, folder, names, extraction_options=options, device=pycolmap.Device.cpu)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = MIN_INLIERS
+    verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_INLIERS)
     verification.ransac.random_seed = seed
     verification.ransac.num_threads = 1
     verification.ransac.max_num_trials = MAX_TRIALS

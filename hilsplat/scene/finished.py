@@ -38,8 +38,7 @@ class SceneParts:
 
     def as_inputs(self) -> dict[str, Path]:
         """Return the existing parts by name, in the format of a provenance record's inputs."""
-        named = {part.name: getattr(self, part.name) for part in fields(self)}
-        return {name: path for name, path in named.items() if path is not None}
+        return {part.name: path for part in fields(self) if (path := getattr(self, part.name)) is not None}
 
 
 @dataclass(frozen=True)
