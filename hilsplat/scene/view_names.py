@@ -92,11 +92,11 @@ def view_names(sources: Sequence[Path]) -> list[str]:
         SceneError: two files would get the same view name, or later stages cannot use a file's name.
     """
     for source in sources:
-        problem = ""
+        problem, num_bytes = "", len(os.fsencode(source.name))
         if "{" in source.name or "}" in source.name or not source.name.isprintable():
             problem = "contains a brace or an unprintable character"  # braces are wildcards in Snakemake
-        elif len(os.fsencode(source.name)) > MAX_NAME_BYTES:
-            problem = f"is longer than {MAX_NAME_BYTES} bytes"
+        elif num_bytes > MAX_NAME_BYTES:
+            problem = f"is too long: {num_bytes} bytes instead of at most {MAX_NAME_BYTES} bytes"
         if problem:
             raise SceneError(f"the name of photograph {str(source)!r} {problem}", fix="rename it")
     same_folder = Counter((source.parent, source.stem) for source in sources)
