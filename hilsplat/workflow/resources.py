@@ -22,6 +22,7 @@ import numpy as np
 
 from hilsplat.base.cards import cards
 from hilsplat.base.errors import ImageError, ModelError
+from hilsplat.base.files import IMAGE_SUFFIXES
 from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.memory import MIB
@@ -30,7 +31,7 @@ from hilsplat.configuration import StageSettings
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.models.card import card_problem
 from hilsplat.models.store import RELEASES, model_path, planned_model
-from hilsplat.scene.layouts import vertex_count
+from hilsplat.scene.layouts import largest_copies, vertex_count
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.semantic_tree.limits import MAX_ALL
 from hilsplat.settings import GaussiansSettings, MasksSettings
@@ -270,7 +271,12 @@ class JobResources:
         if row.generated:
             return Size(*GENERATORS[row.generated.generator].size(stages))
         files = self.plan.data.image_files(row)
-        images = self.plan.data.source_files(row) if isinstance(files, str) else files
+        if isinstance(files, str):  # a folder that a rule writes
+            images = [Path(path) for path in self.plan.data.source_files(row)]
+        else:
+            images = largest_copies(
+                [Path(path) for path in files if Path(path).suffix.lower() in IMAGE_SUFFIXES]
+            )
         return Size(len(images), _first_mp(images, stages.poses.max_side_px))
 
     def _gaussians(self, row: SceneRow) -> int:
@@ -319,11 +325,11 @@ def _sam_s(masks: MasksSettings) -> float:
     return masks.key_views * _pictures(masks) * (picture_s + PICTURE_S + prompts * PROMPT_S)
 
 
-def _first_mp(images: Iterable[str], max_side_px: int) -> float:
+def _first_mp(images: Iterable[Path], max_side_px: int) -> float:
     """Return the megapixels of the first image with a readable header, scaled as `poses` scales it."""
     for image in images:
         try:
-            with opened_image(Path(image)) as opened:
+            with opened_image(image) as opened:
                 width, height = opened.size
         except ImageError:  # labels, sheets and other files next to the images
             continue
