@@ -26,6 +26,11 @@ with suppress(ValueError):  # this is not the main thread
 Points = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]  # positions and colours
 
 
+def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
+    """Return a pose of COLMAP's mappers as a 4 x 4 matrix."""
+    return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])
+
+
 LENGTH_TOLERANCE = 0.01  # maximum deviation of a quaternion's length from 1; programs write at least 3 digits
 
 

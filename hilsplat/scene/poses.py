@@ -20,7 +20,7 @@ from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import stage_log
 from hilsplat.base.removal import delete
 from hilsplat.scene.assemble import Posed, PosedView, few_points_doubt, split_views, write_scene
-from hilsplat.scene.colmap import camera_of, pycolmap, reprojection_errors, sparse_points
+from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
 from hilsplat.scene.features import (
     MIN_INLIERS,
     WorkImage,
@@ -164,8 +164,7 @@ def _reconstruct(
     check_registration(images, out, name, report, settings)
     model, views = models[0], []
     for image in (model.images[image_id] for image_id in model.reg_image_ids()):
-        pose = np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
-        file = work / "images" / image.name
+        pose, file = pose_matrix(image.cam_from_world()), work / "images" / image.name
         views.append(PosedView(image.name, file, camera_of(image), pose))
     split = split_views([view.view for view in views], settings.test_every)
     return views, sparse_points(model), split, report

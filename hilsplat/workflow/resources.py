@@ -22,7 +22,6 @@ import numpy as np
 
 from hilsplat.base.cards import cards
 from hilsplat.base.errors import ImageError, ModelError
-from hilsplat.base.files import IMAGE_SUFFIXES
 from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.memory import MIB
@@ -31,7 +30,7 @@ from hilsplat.configuration import StageSettings
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.models.card import card_problem
 from hilsplat.models.store import RELEASES, model_path, planned_model
-from hilsplat.scene.layouts import largest_copies, vertex_count
+from hilsplat.scene.layouts import vertex_count
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.semantic_tree.limits import MAX_ALL
 from hilsplat.settings import GaussiansSettings, MasksSettings
@@ -270,13 +269,7 @@ class JobResources:
             stages = self.plan.stages(row)
         if row.generated:
             return Size(*GENERATORS[row.generated.generator].size(stages))
-        files = self.plan.data.image_files(row)
-        if isinstance(files, str):  # a folder that a rule writes
-            images = [Path(path) for path in self.plan.data.source_files(row)]
-        else:
-            images = largest_copies(
-                [Path(path) for path in files if Path(path).suffix.lower() in IMAGE_SUFFIXES]
-            )
+        images = self.plan.data.photographs(row)
         return Size(len(images), _first_mp(images, stages.poses.max_side_px))
 
     def _gaussians(self, row: SceneRow) -> int:
