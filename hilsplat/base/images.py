@@ -3,6 +3,7 @@
 import functools
 import io
 import logging
+import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping
@@ -31,6 +32,8 @@ PROFILE_MODES = {b"RGB ": "RGB", b"GRAY": "L", b"CMYK": "CMYK"}
 
 HDR = re.compile(rb"colrnclx..\0[\x10\x12]|cICP.[\x10\x12]", re.DOTALL)
 """The box of AVIF, and the chunk of PNG, that state a transfer function of HDR."""
+
+MAX_PX = 2 * (Image.MAX_IMAGE_PIXELS or 0)  # Pillow refuses more in a file's first picture
 
 MIN_SIDE_PX, MAX_ASPECT = 16, 20  # limits on photographs; all stages were run on 16 x 16 and 320 x 16 px
 
@@ -63,21 +66,19 @@ def open_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> Image.Image
     try:
         with warnings.catch_warnings(action="ignore"):  # about large images and odd EXIF tags
             image = Image.open(file, formats=formats)
-        if max(image.size) > max_side_px:
+            if image.format == "TIFF":
+                image.filename = ""  # else Pillow 13 maps the file into memory, and scrambles turned pictures
+                with suppress(EOFError):
+                    while image.tell() < 4 and image.tag_v2.get(ExifTags.Base.NewSubfileType) == 1:  # type: ignore
+                        image.seek(image.tell() + 1)  # a reduced copy may come first
+        if max(image.size) > max_side_px or math.prod(image.size) > MAX_PX:
             raise Image.DecompressionBombError(f"{image.width} x {image.height} px")
     except Image.DecompressionBombError as error:
         raise ImageError(
             f"image {file} is too large: {str(error).partition(',')[0]}",
-            expected=f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} MP, {max_side_px} px per side",
+            expected=f"at most {MAX_PX / 1e6:.0f} MP, {max_side_px} px per side",
             fix="shrink or remove it",
         ) from error
-    if image.format == "TIFF":
-        image.filename = ""  # else Pillow 13 maps the file into memory, and scrambles turned pictures
-        try:
-            while image.tell() < 4 and image.tag_v2.get(ExifTags.Base.NewSubfileType) == 1:  # type: ignore
-                image.seek(image.tell() + 1)  # a reduced copy may come first
-        except EOFError:
-            image.seek(0)
     return image
 
 

@@ -149,6 +149,17 @@ def test_a_reduced_copy_in_a_tiff_is_not_the_photograph(kinds, tmp_path):
     assert image_size_hw(tmp_path / "a.tif") == expected.shape[:2]
 
 
+def test_a_large_page_after_a_reduced_copy_is_not_read(tmp_path):
+    stream = io.BytesIO()
+    with TiffImagePlugin.AppendingTiffWriter(stream, new=True) as writer:
+        for page, kind in ((gradient(), 1), (Image.new("1", (20_000, 10_000)), 0)):
+            page.save(writer, "TIFF", tiffinfo={254: kind}, compression="tiff_deflate")
+            writer.newFrame()
+    (tmp_path / "a.tif").write_bytes(stream.getvalue())
+    with pytest.raises(ImageError, match=r"a\.tif is too large: 20000 x 10000 px"):
+        read_image(tmp_path / "a.tif")
+
+
 def test_reading_heif_needs_no_preparation(tmp_path, project):
     path = saved(tmp_path, gradient(), ".heic")
     read = f"from pathlib import Path; import hilsplat.base.images as i; i.read_image(Path({str(path)!r}))"
