@@ -76,7 +76,9 @@ class PosesSettings(Section):
         "auto", "lens model; auto: simple_radial, or simple_pinhole for renders"
     )
     single_camera: Literal["auto", "yes", "no"] = knob(
-        "auto", "one camera for all photographs; auto: one per size and EXIF focal length", origin="COLMAP"
+        "auto",
+        "one lens per image size (yes), per size and EXIF focal length (auto), or per image (no)",
+        origin="COLMAP",
     )
     matcher: Literal["auto", "exhaustive", "retrieval"] = knob(
         "auto",

@@ -3,6 +3,8 @@
 import functools
 import io
 import logging
+import math
+import re
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -28,6 +30,11 @@ UPRIGHT = dict(zip(range(2, 9), (Image.Transpose(move) for move in (0, 3, 1, 5, 
 PROFILE_MODES = {b"RGB ": "RGB", b"GRAY": "L", b"CMYK": "CMYK"}
 """Pillow's mode of a colour profile, by the colour space in its header."""
 
+HDR = re.compile(rb"colrnclx..\0[\x10\x12]|cICP.[\x10\x12]", re.DOTALL)
+"""The box of AVIF, and the chunk of PNG, that state a transfer function of HDR."""
+
+MAX_PX = 2 * (Image.MAX_IMAGE_PIXELS or 0)  # Pillow refuses more in a file's first picture
+
 MIN_SIDE_PX, MAX_ASPECT = 16, 20  # limits on photographs; all stages were run on 16 x 16 and 320 x 16 px
 
 SLIVER = 0.01
@@ -50,7 +57,7 @@ def open_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> Image.Image
         OSError: the file is missing or has none of the `FORMATS`.
     """
     formats: tuple[str, ...] = FORMATS
-    if _has_boxes(file):
+    if _head(file, 8)[4:] == b"ftyp":  # the file is made of ISO's boxes, as HEIF and AVIF are
         import pillow_heif  # 30 MB of libraries, which other formats don't need
 
         pillow_heif.register_heif_opener()
@@ -59,25 +66,28 @@ def open_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> Image.Image
     try:
         with warnings.catch_warnings(action="ignore"):  # about large images and odd EXIF tags
             image = Image.open(file, formats=formats)
-        if max(image.size) > max_side_px:
+            if image.format == "TIFF":
+                image.filename = ""  # else Pillow 13 maps the file into memory, and scrambles turned pictures
+                with suppress(EOFError):
+                    while image.tell() < 4 and image.tag_v2.get(ExifTags.Base.NewSubfileType) == 1:  # type: ignore
+                        image.seek(image.tell() + 1)  # a reduced copy may come first
+        if max(image.size) > max_side_px or math.prod(image.size) > MAX_PX:
             raise Image.DecompressionBombError(f"{image.width} x {image.height} px")
     except Image.DecompressionBombError as error:
         raise ImageError(
             f"image {file} is too large: {str(error).partition(',')[0]}",
-            expected=f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} MP, {max_side_px} px per side",
+            expected=f"at most {MAX_PX / 1e6:.0f} MP, {max_side_px} px per side",
             fix="shrink or remove it",
         ) from error
-    if image.format == "TIFF":
-        image.filename = ""  # else Pillow 13 maps the file into memory, and scrambles turned pictures
     return image
 
 
-def _has_boxes(file: Path | io.BytesIO) -> bool:
-    """Whether a file is made of ISO's boxes, as HEIF and AVIF are."""
+def _head(file: Path | io.BytesIO, count: int) -> bytes:
+    """Return the first bytes of a file."""
     if isinstance(file, io.BytesIO):
-        return bytes(file.getbuffer()[4:8]) == b"ftyp"
-    with file.open("rb") as held:
-        return held.read(8)[4:] == b"ftyp"
+        return bytes(file.getbuffer()[:count])
+    with file.open("rb") as stream:
+        return stream.read(count)
 
 
 @contextmanager
@@ -130,6 +140,8 @@ def read_image(
     with foreign(f"image {file}", ImageError, fix=fix), open_image(file, max_side_px) as image:
         if _is_animation(image):
             raise ValueError("it contains several frames of the same size, like an animation")
+        if _is_hdr(image, file):
+            raise ValueError("its colours are HDR (PQ or HLG); export it as JPEG")
         turn = orientation(image) if image.format == "TIFF" else 0  # read first: Pillow turns it upright
         image.load()  # raises only the first time, so nothing may have loaded it before
         turn = turn or orientation(image)
@@ -213,23 +225,29 @@ def require_usable_size(image: object, size_hw: tuple[int, ...], max_side_px: in
 
 def _is_animation(image: Image.Image) -> bool:
     """Return whether a file has a second frame that is no preview and no additional picture of a phone."""
-    size = image.size
+    size, number = image.size, image.tell()
     if image.format in ("MPO", "HEIF"):
         return False
     with suppress(EOFError):  # Pillow counts the frames of a TIFF in quadratic time
-        image.seek(1)
+        image.seek(number + 1)
         same = image.size == size
-        image.seek(0)
+        image.seek(number)
         return same
     return False
+
+
+def _is_hdr(image: Image.Image, file: Path | io.BytesIO) -> bool:
+    """Return whether an image without a profile has a transfer function of HDR (16: PQ, 18: HLG; H.273)."""
+    if image.info.get("icc_profile"):
+        return False
+    if image.format in ("AVIF", "PNG"):
+        return HDR.search(_head(file, 2**20).partition(b"IDAT")[0]) is not None
+    return (image.info.get("nclx_profile") or {}).get("transfer_characteristics") in (16, 18)
 
 
 def _to_srgb(image: Image.Image, info: Mapping[Any, Any], file: object) -> Image.Image:
     """Convert to sRGB with the embedded profile, or else PNG's gamma; without valid ones, assume sRGB."""
     profile = info.get("icc_profile")
-    nclx = info.get("nclx_profile") or {}
-    if not profile and nclx.get("transfer_characteristics") in (16, 18):  # ITU-T H.273
-        raise ValueError("its colours are HDR (PQ or HLG); export it as JPEG")
     base = {"RGBA": "RGB", "P": "RGB", "LA": "L", "1": "L"}.get(image.mode, image.mode)
     if profile and PROFILE_MODES.get(profile[16:20], base) == base:  # grey images may carry a profile of RGB
         colours = image if base == image.mode else image.convert(base)
@@ -242,7 +260,8 @@ def _to_srgb(image: Image.Image, info: Mapping[Any, Any], file: object) -> Image
         else:
             assert converted is not None  # only in-place conversion returns None
             return converted
-    colours, gamma = image.convert("RGB"), info.get("gamma", 1 / 2.2)
+    colours = image if image.mode == "RGB" else image.convert("RGB")  # which would copy it
+    gamma = info.get("gamma", 1 / 2.2)
     if profile or "srgb" in info or abs(gamma - 1 / 2.2) < 0.01:  # 1 / 2.2 is nearly sRGB
         return colours
     return colours.point(srgb_codes(np.linspace(0, 1, 256) ** (1 / gamma)).tolist() * 3)

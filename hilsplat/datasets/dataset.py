@@ -89,9 +89,9 @@ class Dataset:
         data_root = root.parent
         if self._has_begun(root):
             return root
-        fixes = dict.fromkeys(_folders(root), f"move its contents to {root}")
+        fixes = dict.fromkeys(subfolders(root), f"move its contents to {root}")
         fixes[data_root] = f"rename it to {root.name} if necessary, and set data_root to its parent folder"
-        fixes |= {deeper / root.name: f"set data_root to {deeper}" for deeper in _folders(data_root)}
+        fixes |= {deeper / root.name: f"set data_root to {deeper}" for deeper in subfolders(data_root)}
         for folder, fix in fixes.items():
             if self._has_begun(folder):
                 raise SceneError(f"{self.title} is in the wrong place", expected=root, found=folder, fix=fix)
@@ -124,9 +124,10 @@ class Dataset:
         return any(self.has_part(root, scene) for scene in self.scenes) or bool(self.found(root))
 
 
-def _folders(folder: Path) -> list[Path]:
-    """Return the subfolders, sorted by name; empty if the folder is missing."""
-    return sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+def subfolders(folder: Path) -> list[Path]:
+    """Return the subfolders that archive programs did not add, sorted by name; empty if it is missing."""
+    folders = folder.iterdir() if folder.is_dir() else ()
+    return sorted(path for path in folders if path.is_dir() and not path.name.startswith((".", "__")))
 
 
 def listing(folder: Path) -> str:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Int
 
-from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.errors import ImageError, SceneError, shorten_list
 from hilsplat.base.files import list_images
 from hilsplat.base.images import image_size_hw, read_mask
 from hilsplat.base.levels import Level, composed, plain_text
@@ -139,11 +139,10 @@ class LabelledScene:
         missing = [view for view in self.views if view not in names]
         lacking = f"labelled views of {self.dataset}/{self.scene} have no pose: {', '.join(missing)}"
         if len(posed) < self.min_posed * len(self.views):
-            listed = [*sorted(names)[:5], *(["..."] if len(names) > 5 else [])]
             raise SceneError(
                 lacking,
                 expected=f"a pose for {self.min_posed:.0%} of the {len(self.views)} labelled views",
-                found=f"{len(names)} posed views: {', '.join(listed)}",
+                found=f"{len(names)} posed views: {shorten_list(sorted(names), 5)}",
                 fix="use the poses included in the data set, or register these images",
             )
         if missing:

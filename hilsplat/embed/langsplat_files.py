@@ -8,6 +8,7 @@ numbered across all four maps. File names are truncated at their first dot.
 """
 
 import logging
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -49,7 +50,8 @@ def stem_of(view: str) -> str:
 def stems_of(views: list[str]) -> dict[str, str]:
     """Return the stem of each view, or raise an ArtifactError if two views have the same stem."""
     stems = {view: stem_of(view) for view in views}
-    if twins := [view for view in views if list(stems.values()).count(stems[view]) > 1]:
+    counts = Counter(stems.values())
+    if twins := [view for view in views if counts[stems[view]] > 1]:
         shared = f"these views would use the same LangSplat files: {', '.join(twins[:4])}"
         raise ArtifactError(shared, fix="rename the images so that their names differ before the first dot")
     return stems
@@ -113,7 +115,8 @@ def read_views(
     """Read training views (`read_view`); also return why others, whose files cannot be used, are left out.
 
     Raises:
-        ArtifactError: less than `MIN_SHARE` of the views can be used, or two views share their files.
+        ArtifactError: less than `MIN_SHARE` of the views can be used, two views share their files, or vectors
+            differ in width.
     """
     maps, lost = {}, []
     for view in track(stems_of([*cameras]), "LangSplat's files"):
@@ -127,6 +130,10 @@ def read_views(
             found="; ".join(lost[:3]),
             fix="pass the language_features folder that LangSplat wrote for the same images",
         )
+    widths = sorted({vectors.shape[1] for _, vectors in maps.values()})
+    if len(widths) > 1:
+        problem = f"{folder} has vectors of {' and '.join(map(str, widths))} numbers"
+        raise ArtifactError(problem, expected="vectors of one CLIP model", fix="run the preprocessing again")
     return maps, lost
 
 
@@ -176,7 +183,7 @@ def require_model(
     would not distinguish all CLIP models.
     """
     model.require_width(vectors.shape[1], f"{files / stem_of(view)}_f.npy")
-    rows = np.arange(len(masks))[:: max(1, len(masks) // CHECKED_MASKS)]
+    rows = np.arange(0, len(masks), -(-len(masks) // CHECKED_MASKS) or 1)
     again = model.embed_masks(image, masks, ClipSettings(crop="langsplat"), rows)
     cosines = (again.astype(np.float32) * vectors[rows].astype(np.float32)).sum(axis=1)
     cosine = float(np.median(cosines)) if len(rows) else 1.0

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Shaped
 
-from hilsplat.base.artifacts import damaged, read_npy, rebuild_command, sealed
+from hilsplat.base.artifacts import read_npy, rebuild_command, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.segment.digests import require_same_masks
 
@@ -16,15 +16,11 @@ def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C
     """Read the CLIP vectors of all masks, in the row order of artifact `folder`; zero for missing vectors.
 
     Raises:
-        ArtifactError: a file is missing or damaged, or its vectors differ in width or do not have length 1.
+        ArtifactError: a file is missing or damaged, or its vectors do not have length 1.
         MisalignedArtifactError: the vectors were computed from other masks.
     """
     views = require_same_masks(clip_folder, folder)
     vectors = {view: read_npy(sealed(clip_folder, f"{view}.npy")) for view in views}
-    widths = {part.shape[1] if part.ndim == 2 else -1 for part in vectors.values()}
-    if len(widths) > 1 or -1 in widths:
-        found = ", ".join(f"{view}: {part.shape}" for view, part in vectors.items())[:300]
-        raise damaged(clip_folder, " contains CLIP vectors that differ in width", found=found)
     for view, part in vectors.items():
         lengths = np.linalg.norm(part.astype(np.float32), axis=1)
         invalid = ~((lengths == 0) | (np.abs(lengths - 1) < UNIT_TOLERANCE))  # also NaN

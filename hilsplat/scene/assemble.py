@@ -67,15 +67,10 @@ def undistort(view: PosedView, folder: Path, max_side_px: int = 2**16) -> PosedV
         return replace(view, image=target)
     camera = pinhole_of(view.view, view.camera, max_side_px)
     bitmap = pycolmap.Bitmap.from_array(read_image(view.image))
-    warped, _ = pycolmap.undistort_image(_options(max_side_px), bitmap, view.camera)
+    options = pycolmap.UndistortCameraOptions(max_image_size=max_side_px)
+    warped, _ = pycolmap.undistort_image(options, bitmap, view.camera)
     write_png(target, warped.to_array())
     return replace(view, image=target, camera=camera, photo=view.photo or photo_of(view.camera))
-
-
-def _options(max_side_px: int) -> pycolmap.UndistortCameraOptions:
-    options = pycolmap.UndistortCameraOptions()
-    options.max_image_size = max_side_px
-    return options
 
 
 def pinhole_of(view: str, lens: pycolmap.Camera, max_side_px: int) -> pycolmap.Camera:
@@ -84,7 +79,7 @@ def pinhole_of(view: str, lens: pycolmap.Camera, max_side_px: int) -> pycolmap.C
     Raises:
         ImageError: the image would be too small, or the lens maps several directions in it to one pixel.
     """
-    pinhole = pycolmap.undistort_camera(_options(max_side_px), lens)
+    pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(max_image_size=max_side_px), lens)
     require_usable_size(view, (pinhole.height, pinhole.width))
     across = (np.linspace(0, side, CHECKED_DIRECTIONS) for side in (pinhole.width, pinhole.height))
     xy = np.stack(np.meshgrid(*across), axis=-1).reshape(-1, 2)

@@ -127,7 +127,7 @@ def split_scene(scene: Scene, out: Path, count: int, min_share: float) -> Blocks
     Raises:
         SettingsError: there are fewer than `MIN_VIEWS` views per block.
     """
-    cameras = [scene.cameras[name] for name in scene.cameras.names]
+    cameras = [*scene.cameras]
     if len(cameras) < MIN_VIEWS * count:
         raise SettingsError(
             f"{scene.name} has too few views for {count} blocks",

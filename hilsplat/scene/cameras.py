@@ -125,23 +125,21 @@ class Cameras:
     def save(self, path: Path) -> None:
         """Write `cameras.npz` atomically."""
         require_types(Cameras, vars(self), path, LIMITS)
-        lenses: dict[str, np.ndarray] = {}
-        if self.photos:
-            none = Photo("", (), (0, 0))
-            photos = [self.photos.get(name, none) for name in self.names]
-            params = [np.pad(photo.params, (0, MAX_PARAMETERS - len(photo.params))) for photo in photos]
-            lenses = {
-                "photo_model": np.array([photo.model for photo in photos], dtype=np.str_),
-                "photo_params": np.array(params, dtype=np.float64),
-                "photo_size_hw": np.array([photo.size_hw for photo in photos], dtype=np.int32),
-            }
+        none = Photo("", (), (0, 0))
+        photos = [self.photos.get(name, none) for name in self.names] if self.photos else []
+        params = [np.pad(photo.params, (0, MAX_PARAMETERS - len(photo.params))) for photo in photos]
+        lenses = {
+            "photo_model": np.array([photo.model for photo in photos], dtype=np.str_),
+            "photo_params": np.array(params, dtype=np.float64),
+            "photo_size_hw": np.array([photo.size_hw for photo in photos], dtype=np.int32),
+        }
         write_npz(
             path,
             names=np.array(self.names, dtype=np.str_),
             cam_from_world=self.cam_from_world.astype(np.float64),
             K=self.K.astype(np.float64),
             size_hw=self.size_hw.astype(np.int32),
-            **lenses,
+            **(lenses if photos else {}),
         )
 
     @staticmethod

@@ -80,11 +80,8 @@ def reprojection_errors(model: pycolmap.Reconstruction) -> dict[str, Float64[np.
     for image_id in model.reg_image_ids():
         image = model.images[image_id]
         seen = image.get_observation_points2D()
-        if not seen:
-            errors[image.name] = np.zeros(0)
-            continue
-        measured = np.array([point.xy for point in seen])
-        xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen])
+        measured = np.array([point.xy for point in seen]).reshape(-1, 2)
+        xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen]).reshape(-1, 3)
         pose = image.cam_from_world().matrix()
         projected = camera_of(image).img_from_cam(xyz @ pose[:, :3].T + pose[:, 3], check_cheirality=False)
         errors[image.name] = np.linalg.norm(projected - measured, axis=1)

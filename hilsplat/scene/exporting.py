@@ -1,7 +1,8 @@
 """Export of a scene for other programs (COLMAP, nerfstudio), in the coordinates of the scene's source."""
 
-import errno
+import os
 import shutil
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,13 +10,14 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from hilsplat.base.atomic import atomic_folder
+from hilsplat.base.rotations import quaternion_of
 from hilsplat.scene.assemble import move_cameras
-from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.posed_images import PosedImage, write_posed_images
 from hilsplat.scene.scene import Scene
 
-POINT_BYTES = 51
-"""Size of a point without a track in COLMAP's points3D.bin, which begins with the number of points."""
+PINHOLE = 1  # number of COLMAP's camera model fx, fy, cx, cy
+POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error_px", "<f8"), ("track", "<u8")])
+"""A point without a track, as in COLMAP's points3D.bin."""
 
 
 def in_source(scene: Scene) -> tuple[list[PosedImage], Float64[np.ndarray, "P 3"]]:
@@ -28,11 +30,10 @@ def in_source(scene: Scene) -> tuple[list[PosedImage], Float64[np.ndarray, "P 3"
 
 def posed_images(scene: Scene, cam_from_world: Float64[np.ndarray, "V 4 4"]) -> list[PosedImage]:
     """Return the undistorted images of all views, with the given poses and the scene's split."""
-    images = []
-    for name, pose in zip(scene.cameras.names, cam_from_world, strict=True):
-        camera, split = scene.cameras[name], scene.split[name]
-        images.append(PosedImage(name, scene.image_path(name), pose, camera.K, camera.size_hw, split=split))
-    return images
+    return [
+        PosedImage(c.name, scene.image_path(c.name), pose, c.K, c.size_hw, split=scene.split[c.name])
+        for c, pose in zip(scene.cameras, cam_from_world, strict=True)
+    ]
 
 
 def write_colmap(scene: Scene, out: Path) -> None:
@@ -48,28 +49,30 @@ def add_colmap(scene: Scene, folder: Path) -> None:
         shutil.copyfile(scene.image_path(view), folder / "images" / view)
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
-    pinhole_model(*in_source(scene), scene.points_rgb).write_binary(model)
-    points = model / "points3D.bin"  # is written last; COLMAP ignores a full disk
-    if points.stat().st_size != 8 + POINT_BYTES * len(scene.points_rgb):
-        raise ChildProcessError(errno.EIO, "COLMAP wrote an incomplete file", str(points))
+    write_model(model, *in_source(scene), scene.points_rgb)
 
 
-def pinhole_model(
-    images: Sequence[PosedImage], xyz: Float64[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"]
-) -> pycolmap.Reconstruction:
-    """Return a COLMAP model of pinhole cameras and points without tracks."""
-    model = pycolmap.Reconstruction()
-    for number, posed in enumerate(images, start=1):
-        (height, width), K = posed.size_hw, posed.K
-        lens = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(model="PINHOLE", width=width, height=height, params=lens, camera_id=number)
-        )
-        image = pycolmap.Image(name=posed.name, camera_id=number, image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(posed.cam_from_world[:3]))
-    for position, colour in zip(xyz, rgb, strict=True):
-        model.add_point3D(position, pycolmap.Track(), colour)
-    return model
+def write_model(
+    folder: Path, images: Sequence[PosedImage], xyz: Float64[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"]
+) -> None:
+    """Write a binary COLMAP model of pinhole cameras and points without tracks (pycolmap hides write errors).
+
+    Without `rigs.bin` and `frames.bin`, COLMAP gives each image a rig of its own.
+    """
+    count = struct.pack("<Q", len(images))
+    cameras, poses = [count], [count]
+    for number, image in enumerate(images, start=1):
+        (height, width), K, pose = image.size_hw, image.K, image.cam_from_world
+        lens = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+        cameras.append(struct.pack("<IiQQ4d", number, PINHOLE, width, height, *lens))
+        numbers = *quaternion_of(pose[:3, :3]), *pose[:3, 3]
+        name_and_observations = os.fsencode(image.name) + bytes(1 + 8)
+        poses.append(struct.pack("<I7dI", number, *numbers, number) + name_and_observations)
+    points = np.zeros(len(xyz), POINT)
+    points["id"], points["xyz"], points["rgb"], points["error_px"] = 1 + np.arange(len(xyz)), xyz, rgb, -1
+    (folder / "cameras.bin").write_bytes(b"".join(cameras))
+    (folder / "images.bin").write_bytes(b"".join(poses))
+    (folder / "points3D.bin").write_bytes(struct.pack("<Q", len(xyz)) + points.tobytes())
 
 
 def write_nerfstudio(scene: Scene, out: Path) -> None:

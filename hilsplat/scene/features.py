@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags
 
-from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.errors import ImageError
 from hilsplat.base.images import (
     exif_tags,
     open_image,
@@ -122,31 +122,21 @@ def prepare_images(
         size_hw = (pixels.shape[0], pixels.shape[1])
         write_png(folder / view, pixels, WORK_COMPRESSION)
         images.append(WorkImage(view, source, size_hw, exif_focal_px(source, size_hw), exif_time(source)))
-    if damaged and len(images) < min_share * len(sources):
-        if len(damaged) == 1:
-            raise ImageError(*damaged.values())
+    if len(images) < min_share * len(sources):
         raise ImageError(
-            f"{len(damaged)} of {len(sources)} images in {sources[0].parent} cannot be read",
-            found=", ".join(f"{path.name} ({path.stat().st_size} bytes)" for path in damaged),
+            f"{len(damaged)} of {len(sources)} images in {sources[0].parent} cannot be used",
+            found="\n            ".join(" ".join(reason.split()) for reason in damaged.values()),
             fix="remove them from the folder or replace them with intact copies",
         )
     return images, damaged
 
 
 def lenses_of(images: Sequence[WorkImage], camera_model: str, single_camera: str) -> list[Lens]:
-    """Group views by lens: by size and EXIF focal length ("auto"), all together ("yes") or singly ("no")."""
+    """Group views by lens: by size and EXIF focal length ("auto"), by size ("yes"), or singly ("no")."""
     groups: dict[object, list[WorkImage]] = {}
     for image in images:
         key = {"yes": image.size_hw, "no": image.view}.get(single_camera, (image.size_hw, image.focal_px))
         groups.setdefault(key, []).append(image)
-    if single_camera == "yes" and len(groups) > 1:
-        sizes = sorted({f"{width} x {height}" for (height, width) in (image.size_hw for image in images)})
-        raise SceneError(
-            "poses.single_camera is yes, but the images have several sizes",
-            expected="one size (width x height) for all images",
-            found=", ".join(sizes),
-            fix="set poses.single_camera to auto, or keep only images of one size",
-        )
     lenses: list[Lens] = []
     for group in groups.values():
         (height, width), focal = group[0].size_hw, group[0].focal_px
@@ -177,21 +167,16 @@ def find_matches(
     # Import first: extraction would add images as its threads finish, so results would depend on timing.
     names: list[str] = []
     for lens_views, camera_model, params in lenses:
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = camera_model
-        if params is not None:
-            reader.camera_params = ", ".join(map(repr, params))
+        numbers = ", ".join(map(repr, params or ()))
+        reader = pycolmap.ImageReaderOptions(camera_model=camera_model, camera_params=numbers)
         pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, lens_views, reader)
         names += lens_views
-    options = pycolmap.FeatureExtractionOptions()
-    options.num_threads = threads
-    options.use_gpu = False
-    options.max_image_size = settings.max_side_px
+    size = settings.max_side_px
+    options = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False, max_image_size=size)
     options.sift.max_num_features = settings.max_features
     options.sift.peak_threshold = PEAK_THRESHOLD
     pycolmap.extract_features(database, folder, names, extraction_options=options, device=pycolmap.Device.cpu)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = MIN_INLIERS
+    verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_INLIERS)
     verification.ransac.random_seed = seed
     verification.ransac.num_threads = 1
     verification.ransac.max_num_trials = MAX_TRIALS

@@ -38,8 +38,7 @@ class SceneParts:
 
     def as_inputs(self) -> dict[str, Path]:
         """Return the existing parts by name, in the format of a provenance record's inputs."""
-        named = {part.name: getattr(self, part.name) for part in fields(self)}
-        return {name: path for name, path in named.items() if path is not None}
+        return {part.name: path for part in fields(self) if (path := getattr(self, part.name)) is not None}
 
 
 @dataclass(frozen=True)
@@ -127,11 +126,11 @@ def command_name(folder: Path) -> str:
 
 def require_scene_folder(folder: Path) -> None:
     """Raise ArtifactError, with known scenes, if a folder does not exist or contains scenes."""
-    parents = folder.absolute().parents
-    inside = scenes_in(folder) or matching_scenes(scenes_in(parents[0]), f"{folder.name}/*")
+    around = folder.absolute().parent
+    inside = scenes_in(folder) or matching_scenes(scenes_in(around), f"{folder.name}/*")
     if folder.is_dir() and not inside:
         return
-    known = inside or scenes_in(parents[0]) or scenes_in(parents[1])  # results/desk, or results/photos/desk
+    known = inside or scenes_in(around) or scenes_in(around.parent)  # results/desk, or results/photos/desk
     name = f"{folder.parent.name}/{folder.name}"
     first = "correct the name" if known else "change to the folder of the project"
     raise ArtifactError(

@@ -3,6 +3,7 @@
 import re
 import time
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +28,9 @@ UNUSED = (*TRAINED, *MAPS)
 
 PHOTO_FOLDERS = ("images", "input")
 """Folders of photographs: COLMAP's and nerfstudio's, then that of 3DGS's `convert.py`."""
+
+SCALED = re.compile(r"(?<=/images)_([248])(?=/)")
+"""What nerfstudio and Mip-NeRF 360 add to the name of a folder of smaller copies."""
 
 MIN_PHOTOS = 3  # minimum number of photographs for structure from motion
 POSES_BOUNDS = "poses_bounds.npy"  # pose file of LLFF
@@ -168,7 +172,8 @@ def photo_folder(folder: Path) -> Path:
         return folder
     if export := polycam_folders(folder) or record3d_export(folder):
         return export[0]
-    images = [path for path in used_images(folder) if 2 <= len(path.relative_to(folder).parts) <= 3]
+    candidates = largest_copies(used_images(folder))
+    images = [path for path in candidates if 2 <= len(path.relative_to(folder).parts) <= 3]
     has_one_place = len({path.parent for path in images}) == 1
     return images[0].parent if has_one_place and len(images) > num_images else folder
 
@@ -185,6 +190,14 @@ def used_images(folder: Path) -> list[Path]:
         for path in images_below(folder)
         if all(re.sub(r"_\d$", "", part.lower()) not in UNUSED for part in path.relative_to(folder).parts)
     ]
+
+
+def largest_copies(images: Sequence[Path]) -> list[Path]:
+    """Leave out images in folders such as `images_4` if `images` or `images_2` has larger copies of them."""
+    scales = [SCALED.findall(path.as_posix()) for path in images]
+    names = [SCALED.sub("", path.with_suffix("").as_posix()) for path in images]
+    largest = dict(sorted(zip(names, scales, strict=True), reverse=True))  # the last of each name counts
+    return [path for path, name, scale in zip(images, names, scales, strict=True) if scale == largest[name]]
 
 
 def contents(folder: Path) -> str:

@@ -159,13 +159,12 @@ def _register_next(
 
 
 def _global_options(seed: int) -> pycolmap.GlobalPipelineOptions:
-    options = pycolmap.GlobalPipelineOptions()
+    options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=seed)
+    options.min_num_matches, options.min_model_size = MIN_INLIERS, MIN_PHOTOS
     mapper = options.mapper
-    options.num_threads = mapper.num_threads = 1
+    mapper.num_threads = 1
     mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
-    options.min_num_matches = MIN_INLIERS
-    options.min_model_size = MIN_PHOTOS
-    options.random_seed = mapper.random_seed = mapper.rotation_averaging.random_seed = seed
+    mapper.random_seed = mapper.rotation_averaging.random_seed = seed
     mapper.global_positioning.random_seed = mapper.retriangulation.random_seed = seed
     mapper.global_positioning.use_gpu = False
     mapper.bundle_adjustment.ceres.use_gpu = False

@@ -70,7 +70,17 @@ def match_pairs(
     """
 
     def match(pair: tuple[int, int]) -> tuple[UInt32[np.ndarray, "M 2"], pycolmap.TwoViewGeometry]:
-        return _matched(views[pair[0]], views[pair[1]], options)
+        one, other = views[pair[0]], views[pair[1]]
+        matches = mutual_matches(one, other)
+        if len(matches) < MIN_MATCHES:
+            return matches[:0], pycolmap.TwoViewGeometry()
+        limits = copy.deepcopy(options)
+        # With fewer matches, a larger share of them must be inliers, so RANSAC needs fewer trials.
+        min_share = options.min_num_inliers / len(matches)
+        limits.ransac.min_inlier_ratio = max(options.ransac.min_inlier_ratio, min_share)
+        return matches, pycolmap.estimate_two_view_geometry(
+            one.camera, one.points, other.camera, other.points, matches, limits
+        )
 
     verified = []
     with pycolmap.DatabaseTransaction(database):
@@ -82,24 +92,6 @@ def match_pairs(
             if len(geometry.inlier_matches) >= options.min_num_inliers:
                 verified.append((one, other))
     return verified
-
-
-def _matched(
-    one: ViewFeatures, other: ViewFeatures, options: pycolmap.TwoViewGeometryOptions
-) -> tuple[UInt32[np.ndarray, "M 2"], pycolmap.TwoViewGeometry]:
-    """Return the matches of a pair of views, and the two-view geometry that fits them, if any."""
-    matches = mutual_matches(one, other)
-    if len(matches) < MIN_MATCHES:
-        return matches[:0], pycolmap.TwoViewGeometry()
-    options = copy.deepcopy(options)
-    # With fewer matches, a larger share of them must be inliers, so RANSAC needs fewer trials.
-    options.ransac.min_inlier_ratio = max(
-        options.ransac.min_inlier_ratio, options.min_num_inliers / len(matches)
-    )
-    geometry = pycolmap.estimate_two_view_geometry(
-        one.camera, one.points, other.camera, other.points, matches, options
-    )
-    return matches, geometry
 
 
 def mutual_matches(one: ViewFeatures, other: ViewFeatures) -> UInt32[np.ndarray, "M 2"]:

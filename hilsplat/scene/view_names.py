@@ -39,7 +39,6 @@ def name_parts(name: str) -> tuple[str, ...]:
 ADDED = re.compile(r"^[0-9a-f]{8}-|(_(jpe?g|png|tiff?|bmp|webp|heic))+\.rf\.[0-9a-z]{20,}$")
 """What Label Studio puts before, and Roboflow behind, the name of an uploaded picture."""
 
-
 PLAIN = {(folder,) for folder in PHOTO_FOLDERS}
 """Folders that don't distinguish photographs, so that they may be missing or have another name."""
 
@@ -93,13 +92,13 @@ def view_names(sources: Sequence[Path]) -> list[str]:
         SceneError: two files would get the same view name, or later stages cannot use a file's name.
     """
     for source in sources:
-        name, num_bytes = source.name, len(os.fsencode(source.name))
-        if "{" in name or "}" in name or not name.isprintable():  # braces are wildcards in Snakemake
-            problem = f"the name of photograph {str(source)!r} contains a brace or an unprintable character"
-            raise SceneError(problem, fix="rename it")
-        if num_bytes > MAX_NAME_BYTES:
-            limit, problem = f"at most {MAX_NAME_BYTES} bytes", f"the name of photograph {source} is too long"
-            raise SceneError(problem, expected=limit, found=num_bytes, fix="rename it")
+        problem, num_bytes = "", len(os.fsencode(source.name))
+        if "{" in source.name or "}" in source.name or not source.name.isprintable():
+            problem = "contains a brace or an unprintable character"  # braces are wildcards in Snakemake
+        elif num_bytes > MAX_NAME_BYTES:
+            problem = f"is too long: {num_bytes} bytes instead of at most {MAX_NAME_BYTES} bytes"
+        if problem:
+            raise SceneError(f"the name of photograph {str(source)!r} {problem}", fix="rename it")
     same_folder = Counter((source.parent, source.stem) for source in sources)
     prefixes = [[folder.name for folder in source.parents] for source in sources]
     names = [view_name(source.stem) for source in sources]

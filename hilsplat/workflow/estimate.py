@@ -123,7 +123,7 @@ def forecasts(plan: Plan, cores: int) -> list[str]:
 def _forecast(plan: Plan, resources: JobResources, row: SceneRow, cores: int) -> str:
     from hilsplat.embed.model_check import seconds_of  # onnxruntime is slow to import
 
-    files, stages = plan.data.image_files(row), plan.stages(row)
+    num_photos, stages = resources.size(row).views, plan.stages(row)
     sam, clip, cache = stages.masks, stages.clip, plan.results / ".cache"
     view_s = seconds_of(Path(sam.model), sam.variant, sam.precision, cache)
     crop_s = seconds_of(Path(clip.model), clip.variant, clip.precision, cache)["crop"]
@@ -131,7 +131,7 @@ def _forecast(plan: Plan, resources: JobResources, row: SceneRow, cores: int) ->
     if "preview" in view_s:
         prompt_s = view_s["preview"] + KEPT_PROMPTS * view_s["masks"]
     every = stages.poses.test_every
-    views = len(files) - (len(files) // every if every else 0)
+    views = num_photos - (num_photos // every if every else 0)
     prompts = stages.masks.points_per_side**2
     base_s = view_s["image"] + PICTURE_S
     full_s, guided_s = base_s + prompts * prompt_s, base_s + GUIDED * prompts * prompt_s

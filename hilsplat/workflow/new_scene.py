@@ -13,7 +13,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.files import NAME_RULE, name_problem
 from hilsplat.base.removal import undone_on_error
 from hilsplat.configuration import StageSettings
-from hilsplat.photos.inspection import PhotoReport, inspect_photos
+from hilsplat.photos.check import PhotoReport, inspect_photos
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.layouts import MIN_PHOTOS, contents
 from hilsplat.scene.sheet import (

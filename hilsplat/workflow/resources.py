@@ -269,8 +269,7 @@ class JobResources:
             stages = self.plan.stages(row)
         if row.generated:
             return Size(*GENERATORS[row.generated.generator].size(stages))
-        files = self.plan.data.image_files(row)
-        images = self.plan.data.source_files(row) if isinstance(files, str) else files
+        images = self.plan.data.photographs(row)
         return Size(len(images), _first_mp(images, stages.poses.max_side_px))
 
     def _gaussians(self, row: SceneRow) -> int:
@@ -319,11 +318,11 @@ def _sam_s(masks: MasksSettings) -> float:
     return masks.key_views * _pictures(masks) * (picture_s + PICTURE_S + prompts * PROMPT_S)
 
 
-def _first_mp(images: Iterable[str], max_side_px: int) -> float:
+def _first_mp(images: Iterable[Path], max_side_px: int) -> float:
     """Return the megapixels of the first image with a readable header, scaled as `poses` scales it."""
     for image in images:
         try:
-            with opened_image(Path(image)) as opened:
+            with opened_image(image) as opened:
                 width, height = opened.size
         except ImageError:  # labels, sheets and other files next to the images
             continue

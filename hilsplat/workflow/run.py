@@ -206,7 +206,7 @@ def run(
     with _locked_results(plan.results):
         _recover(command, plan.results)
     if not _has(others, *ELSEWHERE):
-        cores = int(given.cores) if given.cores and given.cores.isdigit() else 0
+        cores = int(given.cores) if given.cores and given.cores.isdecimal() else 0
         for line in forecasts(plan, cores or _all_cores()):
             logger.info("%s", line)
     status = _start(command, plan, targets, scenes, given.forcerun, every_byte)

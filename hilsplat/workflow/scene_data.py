@@ -18,7 +18,7 @@ from hilsplat.base.files import IMAGE_SUFFIXES, stats_of
 from hilsplat.base.lineage import digests_of, sha256_of_json
 from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import absence, image_files, is_exported, label_files, label_sets
-from hilsplat.scene.layouts import dataparser_of, photo_files, transforms_of
+from hilsplat.scene.layouts import dataparser_of, largest_copies, photo_files, transforms_of
 from hilsplat.scene.sheet import DATA_PREFIX, SceneRow
 
 CATEGORY = b'"category"'  # key of the text of an object in a file of labels
@@ -92,6 +92,13 @@ class SceneData:
         if row.generated:
             return self.path(job, row.generated.generator, "images")
         return self.path(job, "source") if is_exported(row.source) else self._folder_files(row)
+
+    def photographs(self, job: Job) -> list[Path]:
+        """Return the photographs of a source folder, without smaller copies; else the files of the source."""
+        files = self.image_files(job)
+        if isinstance(files, str):
+            return [Path(path) for path in self.source_files(job)]
+        return largest_copies([path for path in map(Path, files) if path.suffix.lower() in IMAGE_SUFFIXES])
 
     def content(self, files: Callable[[Any], str | list[str]]) -> Callable[[Job], str]:
         """Return the parameter function for the digest of a user's files; Snakemake compares only times."""

@@ -189,6 +189,7 @@ ROWS = {
     "a scene that does not exist": row(
         nothing, ("query", "photos/none", "mug"), "results/photos/none is missing"
     ),
+    "a folder at the root of the file system": row(nothing, ("query", "/none", "mug"), "/none is missing"),
     "a results folder in place of a scene": row(
         nothing, ("query", "results", "mug"), "results is a folder of scenes, not a scene", "photos/desk"
     ),

@@ -338,12 +338,14 @@ def test_the_background_of_isat_is_cut_out_of_lower_layers_only():
     info = {"name": "IMG_0001.jpg", "width": WIDTH, "height": HEIGHT}
     hole = thing("__background__", 2.0, 20, 10, 30, 30)
     lost = {**hole, "segmentation": [[900, 900]]}
-    objects = [thing("ring", 1.0, 10, 5, 40, 40), thing("gem", 3.0, 22, 12, 26, 20), hole, lost]
+    gem, coin = thing("gem", 3.0, 22, 12, 26, 20), thing("coin", 2.0, 20, 10, 24, 14)
+    objects = [thing("ring", None, 10, 5, 40, 40), gem, hole, lost, coin]
     notes: list[str] = []
-    ring, gem = regions({"info": info, "objects": objects}, notes=notes)["IMG_0001.png"]
+    ring, gem, coin = regions({"info": info, "objects": objects}, notes=notes)["IMG_0001.png"]
     np.testing.assert_array_equal(ring, box(10, 5, 40, 40) & ~box(20, 10, 30, 30))
     np.testing.assert_array_equal(gem, box(22, 12, 26, 20))
-    assert "2 of 4 annotations are left out: 1 of the background (__background__)" in notes[0]
+    np.testing.assert_array_equal(coin, box(20, 10, 24, 14))
+    assert "2 of 5 annotations are left out: 1 of the background (__background__)" in notes[0]
 
 
 # -- labels for LangSplat's evaluation --------------------------------------------------------------

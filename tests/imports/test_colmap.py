@@ -140,6 +140,7 @@ def test_models_with_observations_are_read_as_by_pycolmap(write_model, tmp_path)
         ("images.txt", lambda text: b"1 2 3\n" + text, r"images\.txt, line 1"),
         ("points3D.txt", lambda text: text.replace(b"3 1.0", b"3 x"), r"points3D\.txt, line 3"),
         ("points3D.txt", lambda text: text + b"9 1 2 3\n", r"points3D\.txt, line 9"),
+        ("points3D.txt", lambda text: 400 * b"9" + text, r"points3D\.txt, line 1"),
         ("cameras.txt", lambda text: b"2" + text[1:], "has camera 1, which the model lacks"),
         ("cameras.txt", lambda text: text.replace(b"80 78", b".83 1.1"), "a focal length of 0.1 to 50 sides"),
         ("images.txt", lambda text: b"", "0 of 0 views of"),

@@ -220,6 +220,7 @@ def test_a_dry_run_of_an_archive_leaves_nothing(kind, tmp_path):
         ("input",),
         ("images", "input"),
         ("images", "images_2", "images_4"),
+        ("images_2", "images_4", "images_8"),
         ("DCIM/100APPLE",),
         ("photos", "output/renders", ".thumbnails"),
         ("photos", "masks"),

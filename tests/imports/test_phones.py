@@ -167,7 +167,9 @@ def test_corrected_folders_without_cameras_are_passed_over(tmp_path):
 
 def test_long_recordings_are_thinned_evenly(tmp_path, monkeypatch):
     monkeypatch.setattr(phones, "MAX_VIEWS", 4)
-    source = read_source(find_known_poses(record3d(tmp_path)))
+    folder = record3d(tmp_path)
+    shutil.copy(folder / "rgb/0.png", folder / "rgb/\u00b2.png")  # its name isn't a number
+    source = read_source(find_known_poses(folder))
     assert [view.name for view in source.views] == ["0.png", "2.png", "3.png", "5.png"]
 
 

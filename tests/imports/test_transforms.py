@@ -203,6 +203,12 @@ def test_the_split_of_the_source_is_kept(lists, held_out, tmp_path):
     assert "".join(view.name[7] for view in source.views if view.is_test) == held_out
 
 
+def test_a_split_without_training_views_is_refused(tmp_path):
+    folder = write(tmp_path, PLAIN, {**NUMBERS, "test_filenames": NAMES})
+    with pytest.raises(SceneError, match=r"transforms\.json holds out all 6 views"):
+        read_source(find_known_poses(folder))
+
+
 def test_the_test_frames_of_scannetpp_are_held_out(tmp_path, imported):
     """They are a second list of frames, not names."""
     folder = write(tmp_path / "in", PLAIN, NUMBERS)
@@ -256,8 +262,34 @@ def test_a_map_does_not_replace_a_missing_image(maps, tmp_path):
     assert path in [view.image for view in read_source(find_known_poses(named)).views]
 
 
+@pytest.mark.parametrize("kind", ["transforms", "llff"])
+def test_without_the_photographs_their_largest_copies_are_used(kind, tmp_path, imported):
+    folder = write(tmp_path / "in", SQUARE, {**SIZE, "fl_x": FX})
+    if kind == "llff":
+        rows = [[*pose[:3, [1, 0, 2, 3]].T, [HEIGHT, WIDTH, FX]] for pose in POSES.values()]
+        rows = np.array(rows) * np.array([1, 1, -1, 1, 1])[:, None]
+        rows = rows.transpose(0, 2, 1).reshape(6, 15)
+        np.save(folder / "poses_bounds.npy", np.column_stack([rows, np.ones((6, 2))]))
+        (folder / "transforms.json").unlink()
+    (folder / "images").rename(folder / "images_4")
+    for copy, factor in (("images_2", 2), ("images_8", 4)):
+        lens = world.pinhole(*[FX / factor] * 2, WIDTH / 2 / factor, HEIGHT / 2 / factor)
+        size = WIDTH // factor, HEIGHT // factor
+        world.save(folder / copy, {name: world.picture(lens, *size, pose) for name, pose in POSES.items()})
+    views, _, _, report = imported(folder)
+    assert {(view.camera.width, view.camera.height) for view in views} == {(WIDTH // 2, HEIGHT // 2)}
+    world.require_right(views, right("abcdef"), 40)
+    assert any(f"the images in {folder}/images_2, which are smaller" in note for note in report["warnings"])
+
+
 def posed(matrix):
     return lambda frame: frame.update(transform_matrix=matrix.tolist())
+
+
+def at(x):
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
 
 
 def changed(folder, change):
@@ -319,6 +351,9 @@ def test_views_that_all_have_one_pose_are_refused(tmp_path):
     changed(folder, lambda content: [posed(np.eye(4))(frame) for frame in content["frames"]])
     with pytest.raises(SceneError, match="same pose"):
         read_source(find_known_poses(folder))
+    # Cameras that only move, in coordinates of a map.
+    changed(folder, lambda content: [posed(at(4e6 + row))(content["frames"][row]) for row in range(6)])
+    assert len(read_source(find_known_poses(folder)).views) == 6
 
 
 def test_two_frames_with_one_image_are_both_left_out(tmp_path):
@@ -405,6 +440,12 @@ def test_missing_and_damaged_points_are_refused_by_name(content, tmp_path):
         (folder / "points.ply").write_bytes(content)
     with pytest.raises(SceneError, match=r"points\.ply, with the points, cannot be read"):
         read_source(find_known_poses(folder))
+
+
+def test_a_header_without_an_end_is_not_searched_for_it(tmp_path):
+    (tmp_path / "a.ply").write_bytes(b"ply\ncomment " + bytes(2**21))
+    with pytest.raises(SceneError, match="not a PLY file with a header of at most 1048576 bytes"):
+        read_ply_points(tmp_path / "a.ply")
 
 
 def test_blender_s_second_file_is_the_test_set_and_the_third_replaces_it(tmp_path, imported):

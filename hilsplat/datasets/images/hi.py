@@ -62,9 +62,8 @@ def open_annotated(root: Path, scene: str) -> LabelledScene:
     """
     ANNOTATED.require(root, scene)
     warnings: list[str] = []
-    views: dict[str, tuple[LabelledRegion, ...]] = {}
-    for view, path in label_files(root / scene).items():
-        views[view] = annotated_regions(path, warnings)
+    files = label_files(root / scene)
+    views = {view: annotated_regions(path, warnings) for view, path in files.items()}
     return LabelledScene("annotated", scene, {}, None, views, tuple(warnings), MIN_POSED)
 
 

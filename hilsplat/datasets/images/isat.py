@@ -186,7 +186,7 @@ def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
         nested = isinstance(value[0][0], list)
         polygons = tuple(np.array(points, dtype=np.float64) for points in (value if nested else [value]))
         usable = all(ring.shape == (len(ring), 2) and (abs(ring) < 2**31).all() for ring in polygons)
-    except (TypeError, IndexError, KeyError, ValueError):
+    except (ArithmeticError, LookupError, TypeError, ValueError):
         usable = False
     if not usable:
         raise SceneError(
@@ -206,7 +206,7 @@ def _box(
     try:
         box = extent if value is None else np.array(value, dtype=np.float64)
         usable = box.shape == (4,) and bool(np.isfinite(box).all())
-    except (TypeError, ValueError):
+    except (ArithmeticError, TypeError, ValueError):
         usable = False
     if not usable:
         raise SceneError(

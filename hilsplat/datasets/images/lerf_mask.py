@@ -12,7 +12,7 @@ from pathlib import Path
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_masks
 from hilsplat.base.images import image_size_hw
-from hilsplat.datasets.dataset import Dataset
+from hilsplat.datasets.dataset import Dataset, subfolders
 from hilsplat.datasets.labelled import (
     LabelledRegion,
     LabelledScene,
@@ -67,9 +67,9 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 def _mask_folders(folder: Path, test: tuple[str, ...]) -> dict[str, Path]:
     """Return the mask folder of each test view; folder i belongs to `test[i]`."""
-    places = [entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")]
+    places = subfolders(folder)
     numbers = sorted((int(entry.name), entry) for entry in places if entry.name.isdecimal())
-    strange = sorted(entry.name for entry in places if not entry.name.isdecimal())
+    strange = [entry.name for entry in places if not entry.name.isdecimal()]
     if strange or [number for number, _ in numbers] != list(range(len(test))):
         raise SceneError(
             f"the folders in {folder} do not match the test views",

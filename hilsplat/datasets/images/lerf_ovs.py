@@ -44,8 +44,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 def label_files(folder: Path) -> dict[str, Path]:
     """Return the label files of a folder by view; raise SceneError if there are none."""
-    paths = sorted(path for path in folder.glob("*.json") if path.name[0] != ".")
-    files = {view_name(path.stem): path for path in paths}
+    files = {view_name(path.stem): path for path in sorted(folder.glob("[!.]*.json"))}
     if not files:
         raise SceneError(
             f"{folder} has no label files",

@@ -12,9 +12,9 @@ from hilsplat.base.files import list_files
 from hilsplat.base.images import image_size_hw
 from hilsplat.base.levels import composed
 from hilsplat.datasets import labelled
-from hilsplat.datasets.dataset import ABLATIONS, Dataset
+from hilsplat.datasets.dataset import ABLATIONS, Dataset, subfolders
 from hilsplat.datasets.published import FRAMES, differences
-from hilsplat.scene.layouts import POSES_BOUNDS
+from hilsplat.scene.layouts import has_known_poses
 from hilsplat.scene.placement import SHAPE_TOLERANCE
 from hilsplat.scene.view_names import view_name
 
@@ -32,11 +32,7 @@ def open_scene(root: Path, scene: str) -> labelled.LabelledScene:
     prompts = read_classes(folder / "segmentations" / "classes.txt")
     warnings: list[str] = []
     views: dict[str, tuple[labelled.LabelledRegion, ...]] = {}
-    places = sorted(
-        entry
-        for entry in (folder / "segmentations").iterdir()
-        if entry.is_dir() and not entry.name.startswith((".", "__"))
-    )
+    places = subfolders(folder / "segmentations")
     if not places:
         raise SceneError(
             f"{folder / 'segmentations'} has no segmented views",
@@ -47,9 +43,9 @@ def open_scene(root: Path, scene: str) -> labelled.LabelledScene:
     for entry in places:
         view = view_name(entry.name)
         views[view] = _regions(entry, prompts, image_size_hw(images[view]), warnings)
-    posed = (folder / "sparse").is_dir() or (folder / POSES_BOUNDS).is_file()
     warnings += differences("3d_ovs", scene, {"segmentation": views}, prompts)
-    return labelled.LabelledScene("3d_ovs", scene, images, folder if posed else None, views, tuple(warnings))
+    poses = folder if has_known_poses(folder) else None
+    return labelled.LabelledScene("3d_ovs", scene, images, poses, views, tuple(warnings))
 
 
 def read_classes(path: Path) -> tuple[str, ...]:

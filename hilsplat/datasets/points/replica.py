@@ -136,13 +136,14 @@ def object_of_vertices(
     faces: Int[np.ndarray, "F c"], object_of_face: Int[np.ndarray, " F"], num_vertices: int
 ) -> Int32[np.ndarray, " P"]:
     """Return the most frequent object among each vertex's faces (lowest id if tied), -1 without faces."""
-    corners, owners = faces.reshape(-1).astype(np.int64), np.repeat(object_of_face, faces.shape[1])
-    pairs, votes = np.unique(np.stack([corners, owners]), axis=1, return_counts=True)
+    span = int(object_of_face.max(initial=0)) + 1
+    owned = faces.astype(np.int64) * span + object_of_face[:, None]  # one number for each vertex and object
+    pairs, votes = np.unique(owned, return_counts=True)
     # The first pair of each vertex has the most votes and, among ties, the smallest id.
-    pairs = pairs[:, np.lexsort((pairs[1], -votes, pairs[0]))]
-    vertices, first = np.unique(pairs[0], return_index=True)
+    pairs = pairs[np.lexsort((pairs, -votes, pairs // span))]
+    vertices, first = np.unique(pairs // span, return_index=True)
     result = np.full(num_vertices, -1, dtype=np.int32)
-    result[vertices] = pairs[1, first]
+    result[vertices] = pairs[first] % span
     return result
 
 

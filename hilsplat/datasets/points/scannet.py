@@ -29,6 +29,7 @@ from hilsplat.datasets.points.labelled_points import (
     read_matrices,
     require_file,
 )
+from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.importers.known_views import NOTED_OFFSET, check_centres
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
 
@@ -93,6 +94,8 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
         info = dict(re.findall("(.*) = (.*)", described.read_text("utf-8"))) if described.is_file() else {}
         if "colorHeight" in info and "colorWidth" in info:
             size_hw = int(info["colorHeight"]), int(info["colorWidth"])
+            if not 0 < min(size_hw) <= max(size_hw) <= MAX_SIDE_PX:
+                raise ValueError(f"its sides are not from 1 to {MAX_SIDE_PX} px")
         else:
             size_hw = image_size_hw(frames[0][1]) if frames else (0, 0)
     for number, path in frames:
@@ -186,7 +189,7 @@ def _from_aggregation(
         groups = list(read_json_object(path, ("segGroups",))["segGroups"])
     for row, group in enumerate(groups):
         with decoding(f"{path}, group {row}", expected="objectId, label and a list of segments"):
-            category, number = str(group["label"]), int(group["objectId"]) + 1
+            category, number = str(group["label"]), np.int32(int(group["objectId"]) + 1)
             members = np.asarray(group["segments"], dtype=np.int64)
         rows = np.isin(segments, members)
         if not rows.any():

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.dataset import listing
-from hilsplat.datasets.points.labelled_points import UNPACK_AGAIN, decoding
+from hilsplat.datasets.points.labelled_points import UNPACK_AGAIN, decoding, require_file
 from hilsplat.datasets.waymo import frames
 
 COMPONENTS = (
@@ -43,13 +42,7 @@ def read_component(
     import pyarrow.parquet as parquet
 
     path = component_path(split, tag, segment)
-    if not path.is_file():
-        raise SceneError(
-            f"component {tag} of segment {segment} is missing",
-            expected=path,
-            found=listing(path.parent),
-            fix=f"download {tag}/{segment}.parquet from the same release",
-        )
+    require_file(path, f"download {tag}/{segment}.parquet from the same release")
     with decoding(path):
         names = parquet.read_schema(path).names
         lacking = [name for name in (*columns, *(only or {})) if name not in names]
@@ -162,19 +155,13 @@ def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[frames.C
     """Yield the images of every n-th frame, sorted by time and camera."""
     cameras = _cameras(split, segment)
     pose = "[CameraImageComponent].pose.transform"
-    rows = read_component(split, "camera_image", segment, [FRAME, CAMERA])
-    strange = sorted({row[CAMERA] for row in rows} - set(cameras))
-    if strange:
-        raise SceneError(
-            f"segment {segment} has images from uncalibrated cameras",
-            expected=", ".join(map(str, sorted(cameras))),
-            found=", ".join(map(str, strange)),
-            fix="download camera_image and camera_calibration from the same release",
-        )
+    rows = read_component(split, "camera_image", segment, [FRAME])
     for time in sorted({row[FRAME] for row in rows})[::every]:
         columns = [CAMERA, "[CameraImageComponent].image", pose]
         of_frame = read_component(split, "camera_image", segment, columns, {FRAME: time})
         for row in sorted(of_frame, key=lambda row: row[CAMERA]):
-            with decoding(component_path(split, "camera_image", segment)):
-                encoded, taken = bytes(row["[CameraImageComponent].image"]), _matrix4(row[pose])
-            yield frames.CameraShot(time, cameras[row[CAMERA]], encoded, taken)
+            expected = "images of the cameras in camera_calibration, from the same release"
+            with decoding(component_path(split, "camera_image", segment), expected=expected):
+                camera, encoded = cameras[row[CAMERA]], bytes(row["[CameraImageComponent].image"])
+                shot = frames.CameraShot(time, camera, encoded, _matrix4(row[pose]))
+            yield shot

@@ -7,7 +7,6 @@ every detail of the text format. Rigs and frames are not read, because images ha
 import io
 import struct
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,7 +25,6 @@ FIX = "copy it again, or export the model again with COLMAP"
 
 PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
 """Number of lens parameters, by COLMAP's camera model id."""
-
 
 Row = TypeVar("Row")
 
@@ -143,29 +141,25 @@ def _binary_point(file: io.BytesIO) -> tuple[float, ...]:
 # -- text -----------------------------------------------------------------------------------------
 
 
-def _text(path: Path, expected: str, record: Callable[[str], Row | None]) -> list[Row]:
-    """Read each line of a file but comments; `record` returns None for a line without a record of its own."""
+def _text(path: Path, expected: str, record: Callable[[str], Row]) -> list[Row]:
+    """Read each line of a file that is neither blank nor a comment."""
     rows = []
     with foreign(path, fix=FIX):
         text = regular(path).read_text(encoding="utf-8-sig", errors="surrogateescape")
     for number, line in enumerate(text.split("\n"), 1):
-        if line.startswith("#"):
+        if not line.strip() or line.startswith("#"):
             continue
         try:
             if any("_" in cell and not cell[0].isalpha() for cell in line.split(maxsplit=9)[:9]):
                 raise ValueError  # Python reads 1_0 as 10
-            row = record(line.strip())
-        except (ValueError, IndexError) as error:
+            rows.append(record(line.strip()))
+        except (ArithmeticError, LookupError, ValueError) as error:
             where = f"{path}, line {number}, cannot be read"
             raise SceneError(where, expected=expected, found=repr(line[:80]), fix=FIX) from error
-        if row is not None:
-            rows.append(row)
     return rows
 
 
-def _text_lens(line: str) -> tuple[int, Photo] | None:
-    if not line:
-        return None
+def _text_lens(line: str) -> tuple[int, Photo]:
     number, model, width, height, *params = line.split()
     model_id = int(pycolmap.CameraModelId.__members__.get(model, pycolmap.CameraModelId.INVALID))
     if model_id < 0 or len(params) != PARAMETERS[model_id] or "_" in "".join(params):
@@ -173,9 +167,7 @@ def _text_lens(line: str) -> tuple[int, Photo] | None:
     return int(number), Photo(model, tuple(map(float, params)), (int(height), int(width)))
 
 
-def _text_point(line: str) -> tuple[float, ...] | None:
-    if not line:
-        return None
+def _text_point(line: str) -> tuple[float, ...]:
     number, *cells = line.split(maxsplit=7)[:7]
     x, y, z, *rgb = map(float, cells)
     if len(rgb) != 3 or not all(0 <= value <= 255 for value in rgb):
@@ -187,26 +179,22 @@ def _text_images(path: Path) -> list[ModelImage]:
     """Read images.txt; the second line of an image, its points, may be missing."""
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line with X Y POINT3D_ID for each point"
     images: list[tuple[str, int, tuple[float, ...]]] = []
-    points: dict[int, np.ndarray] = {}  # by number of the image
-    may_be_points = False
+    tables: list[np.ndarray] = []  # of points, by image
 
     def read(line: str) -> None:
-        nonlocal may_be_points
-        cells = line.split()
-        if may_be_points and len(cells) % 3 == 0:
-            with suppress(ValueError):
-                points[len(images) - 1] = np.array(cells, np.float64).reshape(-1, 3)
-                may_be_points = False
+        if len(tables) < len(images):
+            try:
+                tables.append(np.array(line.split(), np.float64).reshape(-1, 3))
                 return
-        may_be_points = bool(line)
-        if line:
-            *numbers, name = line.split(maxsplit=9)
-            int(numbers[0])
-            images.append((name, int(numbers[8]), tuple(map(float, numbers[1:8]))))
+            except ValueError:
+                tables.append(np.zeros((0, 3)))
+        *numbers, name = line.split(maxsplit=9)
+        int(numbers[0])
+        images.append((name, int(numbers[8]), tuple(map(float, numbers[1:8]))))
 
     _text(path, expected, read)
-    seen = (points.get(number, np.zeros((0, 3))) for number in range(len(images)))
+    tables.append(np.zeros((0, 3)))  # for the last image
     return [
         _image(*image, table[:, :2], table[:, 2].astype(np.int64))
-        for image, table in zip(images, seen, strict=True)
+        for image, table in zip(images, tables, strict=False)
     ]

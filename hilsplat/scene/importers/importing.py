@@ -50,11 +50,11 @@ def import_poses(
     source, min_share = read_source(known), settings.min_registered_share
     source.require_most(min_share, known.files[0])
     total = len(source.views) + len(source.left_out)
-    with_image = [view for view in source.views if view.image is not None]
-    files = [view.image for view in source.views if view.image is not None]
+    with_image = {view.image: view for view in source.views if view.image is not None}
     posed: list[tuple[KnownView, PosedView]] = []
     turned: list[str] = []
-    for view, view_name in track([*zip(with_image, view_names(files), strict=True)], "images read"):
+    pairs = [*zip(with_image.values(), view_names([*with_image]), strict=True)]
+    for view, view_name in track(pairs, "images read"):
         try:
             distorted = _with_pixels(view, view_name, work / "images", settings.max_side_px, turned)
             posed.append((view, undistort(distorted, work / "pinhole", settings.max_side_px)))
@@ -84,6 +84,9 @@ def import_poses(
         path.relative_to(known.root).as_posix() if known.root in path.parents else path.name
         for path in known.files
     )
+    observed = [view.report for view in source.views if view.report.get("observations")]
+    num_observations = sum(entry["observations"] for entry in observed)
+    total_px = sum(entry["observations"] * entry["reprojection_error_px"] for entry in observed)
     report = {
         "scene": name,
         "poses": f"imported from {origin}",
@@ -94,7 +97,7 @@ def import_poses(
         "points": len(points[0]),
         "points_from": "source" if source.points is not None else "triangulated from the known poses",
         "points_per_view": points_per_view,
-        "mean_reprojection_error_px": _mean_error_px(source),
+        "mean_reprojection_error_px": round(total_px / num_observations, 4) if num_observations else None,
         "warnings": warnings,
         "views": _view_entries(posed, source, missing),
     }
@@ -106,13 +109,6 @@ def import_poses(
     else:
         split = split_views(names, settings.test_every)
     return views, points, split, report
-
-
-def _mean_error_px(source: Source) -> float | None:
-    observed = [view.report for view in source.views if view.report.get("observations")]
-    num_observations = sum(entry["observations"] for entry in observed)
-    total = sum(entry["observations"] * entry["reprojection_error_px"] for entry in observed)
-    return round(total / num_observations, 4) if num_observations else None
 
 
 def _view_entries(
@@ -179,7 +175,8 @@ def misfit_notes(views: Sequence[KnownView], points: Points, what: str) -> list[
         if misfit < MAX_MISFIT * other or not np.ptp(rgb, axis=0).any():
             return []
         problem = "their colours are not those of their pixels"
-    return [f"the {what} don't match the images: {problem}. Are poses and {what} in the same coordinates?"]
+    question = f"Are poses and {what} in the same coordinates, and the colours those of the photographs?"
+    return [f"the {what} don't match the images: {problem}. {question}"]
 
 
 def _colours_in(

@@ -15,7 +15,7 @@ from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.colmap import Points, as_camera, pycolmap
 from hilsplat.scene.importers.colmap_model import ModelImage, read_model
-from hilsplat.scene.layouts import KnownPoses, photo_folder, used_images
+from hilsplat.scene.layouts import KnownPoses, largest_copies, photo_folder, used_images
 from hilsplat.scene.posed_images import rigid_pose
 from hilsplat.scene.view_names import match_names, name_parts
 
@@ -220,7 +220,8 @@ def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
         images[name] = next((path for path in paths if path.is_file()), None)
     if missing := [name for name, image in images.items() if image is None]:
         listed = {image: image.relative_to(root).as_posix() for image in images.values() if image is not None}
-        below = {path.relative_to(root).as_posix(): path for path in used_images(root) if path not in listed}
+        others = largest_copies([path for path in used_images(root) if path not in listed])
+        below = {path.relative_to(root).as_posix(): path for path in others}
         homes: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
         for name, image in images.items():
             if image is not None:

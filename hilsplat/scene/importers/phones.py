@@ -93,7 +93,7 @@ def read_record3d(known: KnownPoses) -> Source:
             lenses = np.array(coefficients, dtype=np.float64)
             if lenses.shape != (len(rows), 4):
                 raise ValueError(f"perFrameIntrinsicCoeffs has shape {lenses.shape}, but {len(rows)} poses")
-    images = {int(path.stem): path for path in list_images(folder) if path.stem.isdigit()}
+    images = {int(path.stem): path for path in list_images(folder) if path.stem.isdecimal()}
 
     def described(number: int) -> KnownView:
         if number >= len(rows):

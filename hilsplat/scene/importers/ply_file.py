@@ -1,6 +1,7 @@
 """Reader of PLY files of other programs."""
 
 import io
+import re
 from pathlib import Path
 from typing import BinaryIO
 
@@ -30,7 +31,7 @@ def read_ply(path: Path, corners: int | None = None) -> PlyData:
         stream = _with_plain_header(file)
         ply = PlyData.read(stream, known_list_len=lengths)
         if ply.text:
-            rows = path.read_bytes().partition(b"end_header")[2].split(b"\n")[1:]
+            _, *rows = re.split(rb"[\r\n]end_header", path.read_bytes(), maxsplit=1)[1].split(b"\n")
             if any(b"_" in row for row in rows):
                 raise ValueError("a number contains an underscore")  # Python reads 1_0 as 10
             num_more = sum(map(bool, map(bytes.strip, rows))) - sum(element.count for element in ply)
@@ -60,14 +61,11 @@ def read_ply_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.nd
 
 def _with_plain_header(file: BinaryIO) -> BinaryIO:
     """Replace non-ASCII letters in the header, as in comments that name a texture: plyfile refuses them."""
-    header = b""
-    while (line := file.readline(MAX_HEADER_BYTES)) and len(header) < MAX_HEADER_BYTES:
-        header += line
-        if line.strip() == b"end_header":
-            break
-    if not header.startswith(b"ply"):
-        raise ValueError("it is not a PLY file")
-    if header.isascii():
-        file.seek(0)
+    header = re.match(rb"ply.*?[\r\n]end_header", file.read(MAX_HEADER_BYTES), re.DOTALL)
+    if header is None:
+        raise ValueError(f"it is not a PLY file with a header of at most {MAX_HEADER_BYTES} bytes")
+    file.seek(0)
+    if header[0].isascii():
         return file
-    return io.BytesIO(header.decode("ascii", "replace").encode("ascii", "replace") + file.read())
+    plain = header[0].decode("ascii", "replace").encode("ascii", "replace")
+    return io.BytesIO(plain + file.read()[len(header[0]) :])

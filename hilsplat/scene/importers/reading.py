@@ -10,7 +10,7 @@ from hilsplat.base.images import image_size_hw
 from hilsplat.scene.importers.known_views import KnownView, Source, check_centres, read_colmap, read_llff
 from hilsplat.scene.importers.phones import read_polycam, read_record3d
 from hilsplat.scene.importers.transforms import read_transforms
-from hilsplat.scene.layouts import KnownPoses
+from hilsplat.scene.layouts import SCALED, KnownPoses
 
 READERS = {
     "colmap": read_colmap,
@@ -31,21 +31,27 @@ def read_source(known: KnownPoses) -> Source:
     several files list is used once, as the first describes it. Points that are not finite are dropped.
 
     Raises:
-        SceneError: a file cannot be used, or at least three views all have one pose.
+        SceneError: a file cannot be used, all views are held out, or at least three all have one pose.
     """
     source = READERS[known.kind](known)
     poses = np.array([view.cam_from_source for view in source.views])
-    if len(poses) > 2 and np.allclose(poses, poses[0]):
-        raise SceneError(
-            f"all {len(poses)} views of {known.files[0]} have the same pose", fix="export it again"
-        )
+    if len(poses) > 2 and (poses == poses[0]).all():
+        problem = f"all {len(poses)} views of {known.files[0]} have the same pose"
+        raise SceneError(problem, fix="export it again")
     used = {view.image for view in source.views}
     _keep_one_view_per_image(source)
+    if source.views and all(view.is_test for view in source.views):
+        problem = f"{known.files[0]} holds out all {len(source.views)} views for tests"
+        raise SceneError(problem, fix="list fewer views for tests, because others are needed for training")
     if known.kind == "colmap" and (beside := known.root / "images").is_dir():
         others = [path.name for path in list_images(beside) if path not in used]
         source.unposed = [name for name in others if name not in source.left_out]
     source.notes += check_centres({view.name: view.lens for view in source.views if view.image is not None})
     source.notes += _size_notes(source)
+    for folder in sorted({view.image.parent for view in source.views if view.image is not None}):
+        inside = f"/{folder.relative_to(known.root).as_posix()}/"
+        if SCALED.search(inside) and not any(folder.name in view.name for view in source.views):
+            source.notes.append(f"the images in {folder}, which are smaller copies, are used")
     source.notes += [f"{other} also has poses, which are not used" for other in known.others]
     if source.points is not None:
         xyz, rgb = source.points

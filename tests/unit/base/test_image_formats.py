@@ -1,5 +1,6 @@
 """Images of every kind become upright sRGB of 8 bits."""
 
+import io
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -9,11 +10,12 @@ import cv2
 import numpy as np
 import pillow_heif
 import pytest
-from PIL import Image, ImageCms
+from PIL import Image, ImageCms, TiffImagePlugin
+from PIL.PngImagePlugin import PngInfo
 
 from hilsplat.base.errors import ImageError
 from hilsplat.base.files import list_images
-from hilsplat.base.images import read_image
+from hilsplat.base.images import image_size_hw, read_image
 
 pillow_heif.register_heif_opener()  # for writing; reading registers it itself
 
@@ -113,12 +115,49 @@ def test_phone_and_web_formats_are_listed_and_read(tmp_path, suffix):
     ("transfer", "profile", "is_read"),
     [(13, b"", True), (1, b"", True), (16, b"", False), (18, b"", False), (16, SRGB, True)],
 )
-def test_hdr_pictures_of_cameras_are_refused_and_not_shown_dull(transfer, profile, is_read, tmp_path):
-    file = pillow_heif.from_pillow(gradient())
-    file.info.update({"icc_profile": profile} if profile else {})
-    file.save(tmp_path / "a.hif", quality=-1, color_primaries=1, transfer_characteristics=transfer)
+@pytest.mark.parametrize("suffix", [".hif", ".avif", ".png"])
+def test_hdr_pictures_are_refused_and_not_shown_dull(transfer, profile, is_read, suffix, tmp_path):
+    path, info = tmp_path / f"a{suffix}", {"icc_profile": profile} if profile else {}
+    if suffix == ".hif":
+        file = pillow_heif.from_pillow(gradient())
+        file.info.update(info)
+        file.save(path, quality=-1, color_primaries=1, transfer_characteristics=transfer)
+    elif suffix == ".avif":
+        gradient().save(path, **info)
+        srgb, stated = (b"colrnclx\0\1\0" + bytes([code]) for code in (13, transfer))
+        content = path.read_bytes()
+        path.write_bytes(content.replace(srgb, stated) if srgb in content else content)
+    else:
+        chunk = PngInfo()
+        chunk.add(b"cICP", bytes([9, transfer, 0, 1]))
+        gradient().save(path, pnginfo=chunk, **info)
     with nullcontext() if is_read else pytest.raises(ImageError, match="its colours are HDR"):
-        assert read_image(tmp_path / "a.hif").shape == (24, 40, 3)
+        assert read_image(path).shape == (24, 40, 3)
+
+
+@pytest.mark.parametrize("kinds", [(1, 0), (1, 1, 0), (0, 1), (1,)])
+def test_a_reduced_copy_in_a_tiff_is_not_the_photograph(kinds, tmp_path):
+    pages = [gradient() if kind == 0 else gradient().resize((20, 12 + row)) for row, kind in enumerate(kinds)]
+    stream = io.BytesIO()
+    with TiffImagePlugin.AppendingTiffWriter(stream, new=True) as writer:
+        for page, kind in zip(pages, kinds, strict=True):
+            page.save(writer, "TIFF", tiffinfo={254: kind})
+            writer.newFrame()
+    (tmp_path / "a.tif").write_bytes(stream.getvalue())
+    expected = np.asarray(pages[kinds.index(0) if 0 in kinds else 0])
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), expected)
+    assert image_size_hw(tmp_path / "a.tif") == expected.shape[:2]
+
+
+def test_a_large_page_after_a_reduced_copy_is_not_read(tmp_path):
+    stream = io.BytesIO()
+    with TiffImagePlugin.AppendingTiffWriter(stream, new=True) as writer:
+        for page, kind in ((gradient(), 1), (Image.new("1", (20_000, 10_000)), 0)):
+            page.save(writer, "TIFF", tiffinfo={254: kind}, compression="tiff_deflate")
+            writer.newFrame()
+    (tmp_path / "a.tif").write_bytes(stream.getvalue())
+    with pytest.raises(ImageError, match=r"a\.tif is too large: 20000 x 10000 px"):
+        read_image(tmp_path / "a.tif")
 
 
 def test_reading_heif_needs_no_preparation(tmp_path, project):

@@ -19,7 +19,7 @@ from hilsplat.base.ownership import require_own_picture
 from hilsplat.datasets.hierarchy import HierarchyAnnotations, label_path
 from hilsplat.embed.langsplat_files import read_view
 from hilsplat.evaluate.files_stage import read_view_masks
-from hilsplat.photos.inspection import inspect_photos
+from hilsplat.photos.check import inspect_photos
 from hilsplat.scene.poses import run_poses
 from hilsplat.settings import PosesSettings
 from hilsplat.workflow.resources import UNKNOWN_MP, _first_mp

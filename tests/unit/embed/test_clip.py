@@ -11,6 +11,7 @@ from hilsplat.base.artifacts import read_index, read_npy, write_index, write_npz
 from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
 from hilsplat.base.lineage import sha256_of_path
 from hilsplat.configuration import parse_section
+from hilsplat.embed import stage
 from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.stage import chosen_masks, run_clip
 from hilsplat.models import int8
@@ -174,12 +175,15 @@ def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
         ("Identity (one)", "the same vector for all crops"),
     ],
 )
-def test_a_model_that_computes_no_usable_vectors_is_named(own_desk, colour_clip, tmp_path, vectors, problem):
+def test_a_model_that_computes_no_usable_vectors_is_named(
+    red_scene, colour_clip, tmp_path, monkeypatch, vectors, problem
+):
+    monkeypatch.setattr(stage, "FEW_CROPS", 4)  # as many as the scene has
     graph = f"""broken (float[batch,3,4,4] pixel_values) => (float[batch,3] image_embeds) {{
         mean = ReduceMean <axes = [2, 3], keepdims = 0> (pixel_values)
         zero = Sub (mean, mean) one = Exp (zero) image_embeds = {vectors} }}"""
     save_network(colour_clip / "vision_model.onnx", graph)
-    inputs = own_desk / "scene", own_desk / "default/masks", None, tmp_path / "broken", tmp_path / "cache"
+    inputs = *red_scene, None, tmp_path / "broken", tmp_path / "cache"
     with pytest.raises(ModelError, match=rf"clip gives {problem}(.|\n)*another export"):
         run_clip(*inputs, ClipSettings(model=str(colour_clip)), threads=1)
     assert not (tmp_path / "broken").exists()

@@ -136,6 +136,12 @@ def test_invalid_files_are_refused_and_nothing_is_unpickled(tmp_path, maps, vect
         read_view(tmp_path, "a.png", camera(SIZE))
 
 
+def test_files_of_two_clip_models_are_refused(files, scene, tmp_path):
+    np.save(files / "b_f.npy", np.load(files / "b_f.npy")[:, :5])
+    with pytest.raises(ArtifactError, match=r"has vectors of 5 and \d+ numbers"):
+        run_imported_masks(scene, files, tmp_path / "out")
+
+
 def test_missing_files_are_reported_and_half_of_the_views_need_them(files, scene, tmp_path, caplog):
     (files / "b_s.npy").unlink()
     run_imported_masks(scene, files, tmp_path / "out")

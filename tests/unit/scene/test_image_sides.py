@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import ImageError, SceneError
-from hilsplat.photos.inspection import inspect_photos
+from hilsplat.photos.check import inspect_photos
 from hilsplat.scene.assemble import PosedView, undistort
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.features import prepare_images

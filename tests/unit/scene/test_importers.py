@@ -11,7 +11,7 @@ from PIL import Image
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.exporting import write_colmap as export_colmap
-from hilsplat.scene.exporting import write_nerfstudio
+from hilsplat.scene.exporting import write_model, write_nerfstudio
 from hilsplat.scene.importers.colmap_model import read_model
 from hilsplat.scene.layouts import NO_POSES, find_known_poses
 from hilsplat.scene.poses import run_poses
@@ -85,6 +85,12 @@ def test_an_exported_scene_is_read_back_in_the_sources_coordinates(tmp_path, wri
     np.testing.assert_allclose(again.points_xyz, scene.points_xyz, atol=1e-6)
     np.testing.assert_array_equal(again.points_rgb, scene.points_rgb)
     assert again.image_path("a.png").read_bytes() == scene.image_path("a.png").read_bytes()
+
+
+def test_a_model_that_cannot_be_written_raises_the_system_s_error(tmp_path):
+    (tmp_path / "points3D.bin").mkdir()
+    with pytest.raises(IsADirectoryError):
+        write_model(tmp_path, [], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 
 @pytest.mark.parametrize("place", ["poses", "poses/sparse/0", "poses/transforms.json"])

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import SceneError
-from hilsplat.photos.inspection import inspect_photos
+from hilsplat.photos.check import inspect_photos
 from hilsplat.scene.layouts import NO_POSES
 from hilsplat.scene.sheet import choose_scenes, read_sheet
 from hilsplat.workflow.new_scene import add_scene

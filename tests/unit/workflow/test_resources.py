@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from PIL import Image
 
 from hilsplat.scene.layouts import vertex_count
 from hilsplat.workflow.plan import Plan
@@ -53,6 +54,17 @@ print([name for name in ("scipy", "numba", "torch", "cv2", "pandas", "matplotlib
     how = {"capture_output": True, "text": True, "check": True, "cwd": PROJECT}
     done = subprocess.run([sys.executable, "-c", code], **how)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_copies_of_photographs_and_files_of_poses_are_no_views(tmp_path):
+    folder = tmp_path / "desk"
+    for name in ("images", "images_2", "images_4"):
+        (folder / name).mkdir(parents=True)
+        for number in range(5):
+            Image.new("RGB", (200, 100)).save(folder / name / f"{number}.png")
+    (folder / "transforms.json").write_text('{"frames": []}')
+    scene = plan_of(tmp_path, ("photos desk photos desk arbitrary",), groups=["photos"])
+    assert JobResources(scene).size(scene.scenes[0]) == (5, 0.02)
 
 
 def test_a_retry_requests_twice_as_much(tmp_path):

@@ -35,15 +35,6 @@ def label_file(folder, objects, size_wh=(20, 10), name="frame_00001"):
     return path
 
 
-@pytest.mark.parametrize(("layer", "num_px"), [(2.0, 16 - 4), (1.0, 16), (None, 16)])
-def test_the_background_of_isat_is_a_hole_in_lower_layers_and_no_object(layer, num_px, tmp_path):
-    hole = thing("__background__", [[3, 4], [4, 4], [4, 5], [3, 5]], layer=layer)
-    labels = read_isat(label_file(tmp_path, [thing(layer=1.0), hole]))
-    (knife,) = labels.objects
-    assert fill_polygons(knife.polygons, labels.size_hw).sum() == num_px
-    assert knife.box_xyxy.tolist() == [2, 3, 5, 6]
-
-
 @pytest.fixture
 def lerf(tmp_path, true_world):
     """The small world as LERF-OVS's scene `figurines`, its second and fourth view labelled."""
@@ -144,8 +135,10 @@ def test_a_polygon_that_reaches_outside_the_image_is_clipped_and_reported(tmp_pa
         (thing(segmentation=[]), "segmentation is not a polygon"),
         (thing(segmentation="x"), "segmentation is not a polygon"),
         (thing(segmentation=[[2, 3], [3e9, 3], [9, 9]]), "segmentation is not a polygon"),
+        (thing(segmentation=[[2, 3], [10**400, 3], [9, 9]]), "segmentation is not a polygon"),
         (thing(segmentation=[[30, 2], [35, 2], [35, 4]]), r"\(knife\): a polygon is entirely outside"),
         (thing(bbox=[1, 2, 3]), "invalid bbox"),
+        (thing(bbox=[1, 2, 3, 10**400]), "invalid bbox"),
         (thing(segmentation=[[4, 3], [8, 3], [8, 6]], bbox=[4, 3, 4, 3]), r"bbox is not \[x1, y1, x2, y2\]"),
     ],
 )

@@ -135,6 +135,7 @@ def keep_frames_in_archive(folder: Path) -> None:
 LABELS, GROUPS = f"{SCAN}_vh_clean_2.labels.ply", f"{SCAN}.aggregation.json"
 SEGMENTS = f"{SCAN}_vh_clean_2.0.010000.segs.json"
 STRANGER = '{"segGroups": [{"objectId": 0, "label": "wall", "segments": [123456]}]}'
+LARGE = '{"segGroups": [{"objectId": 3000000000, "label": "wall", "segments": [7]}]}'
 NUMBERLESS = '{"segGroups": [{"label": "wall", "segments": [7]}]}'
 
 
@@ -150,9 +151,14 @@ NUMBERLESS = '{"segGroups": [{"label": "wall", "segments": [7]}]}'
         (keep_frames_in_archive, r"still inside scene0000_00\.sens.*SensReader"),
         (text_in(GROUPS, STRANGER), r"group 0 \(wall\): none of its segments.*fix "),
         (text_in(GROUPS, NUMBERLESS), r"group 0 cannot be read: 'objectId' is missing"),
+        (text_in(GROUPS, LARGE), r"group 0 cannot be read: Python integer 3000000001 out of bounds"),
         (text_in(GROUPS, '{"segGroups": null}'), r"aggregation\.json cannot be read"),
         (text_in(SEGMENTS, '{"segIndices": [[1], [2, 3]]}'), r"segs\.json cannot be read"),
         (text_in(f"{SCAN}.txt", "colorHeight = a\ncolorWidth = 9\n"), r"\.txt cannot be read.*whole numbers"),
+        (
+            text_in(f"{SCAN}.txt", "colorHeight = 12\ncolorWidth = 0\n"),
+            r"\.txt cannot be read: its sides are not",
+        ),
         (lambda scan: (scan / f"../../{LABEL_TABLE}").write_bytes(b"\xe9"), r"tsv cannot be read: 'utf-8'"),
         (text_in(SEGMENTS, '{"segIndices": [1]}'), r"segs\.json does not match.*each of 5 .*found     1 val"),
         (text_in("pose/0.txt", "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"), "the pose is not a rotation"),

@@ -174,7 +174,7 @@ def test_damaged_components_are_refused_with_a_fix(root):
     poses.write_bytes(ranges.read_bytes())
     refused("is not component lidar_pose of release 2")
     poses.unlink()
-    refused("component lidar_pose of segment .* is missing.*fix       download")
+    refused("lidar_pose/.* is missing.*fix       download lidar_pose/")
     (root / "all").mkdir()
     (root / "validation").rename(root / "all" / "validation")
     refused("one level too deep\n  fix       move .*all/validation to")
@@ -192,6 +192,7 @@ BEAMS = "[LiDARCalibrationComponent].beam_inclination.values"
         ("camera_calibration", f"{CALIBRATION}.intrinsic.f_u", None, "a lens is not finite"),
         ("camera_calibration", f"{CALIBRATION}.width", None, "calibration/.*cannot be read"),
         ("camera_image", f"{SHOT}.pose.transform", [1.0] * 12, "camera_image/.*cannot reshape"),
+        ("camera_image", "key.camera_name", 9, "9 is missing.*expected  images of the cameras in camera_cal"),
         ("camera_image", f"{SHOT}.image", None, "camera_image/.*cannot be read"),
         ("vehicle_pose", VEHICLE_POSE, None, "vehicle_pose/.*cannot be read"),
         ("vehicle_pose", VEHICLE_POSE, [0.0] * 16, "not a rotation"),

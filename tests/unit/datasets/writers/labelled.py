@@ -21,7 +21,7 @@ from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.images.isat import trace_polygons
 from hilsplat.datasets.points.labelled_points import PlyMesh
 from hilsplat.scene.cameras import Camera, Cameras
-from hilsplat.scene.exporting import pinhole_model
+from hilsplat.scene.exporting import write_model
 from hilsplat.scene.layouts import POSES_BOUNDS
 from hilsplat.scene.posed_images import PosedImage
 
@@ -77,7 +77,7 @@ def write_sparse(
     folder.mkdir(parents=True, exist_ok=True)
     pairs = zip(names, cameras, strict=True)
     images = [PosedImage(name, folder, each.cam_from_world, each.K, each.size_hw) for name, each in pairs]
-    pinhole_model(images, points_xyz, np.full(points_xyz.shape, 128, np.uint8)).write(folder)
+    write_model(folder, images, points_xyz, np.full(points_xyz.shape, 128, np.uint8))
 
 
 def flat_images(
