@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby, pairwise
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -15,6 +16,7 @@ from av.container import InputContainer
 from av.stream import Disposition
 from av.video.stream import VideoStream
 from jaxtyping import Int64, UInt8
+from packaging.version import Version
 from PIL import Image
 
 from hilsplat.base.artifacts import write_json
@@ -43,6 +45,9 @@ LIMIT = {"max_pixels": str(MAX_FRAME_PX)}
 OPTIONS = {"format_whitelist": "mov,matroska,avi", "protocol_whitelist": "file", "enable_drefs": "0"}
 """FFmpeg's options that keep a video from naming other files to read: demuxers of `VIDEO_SUFFIXES` only,
 without playlists; no network; no tracks in external files."""
+
+METADATA: dict[str, Any] = {"metadata_errors": "replace"} if Version(av.__version__).major < 19 else {}
+"""What lets titles be in another encoding than UTF-8; newer releases of PyAV need nothing."""
 
 JPEG_QUALITY = 95
 USUAL_RATE = 30.0  # assumed frames per second for files without a frame rate or timestamps
@@ -141,7 +146,7 @@ def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     expected = "an intact .mp4, .mov, .mkv, .webm or .avi; a truncated .mp4 or .mov lacks its index"
     fix = "copy it again from the camera, or convert it to H.264 in an .mp4"
     with foreign(f"video {video}", expected=expected, fix=fix):
-        container = av.open(f"file:{video}", metadata_errors="replace", options=OPTIONS | LIMIT)
+        container = av.open(f"file:{video}", options=OPTIONS | LIMIT, **METADATA)
     with container:
         picture = Disposition.attached_pic | Disposition.timed_thumbnails | Disposition.still_image
         decodable = [s for s in container.streams.video if s.codec_context and not s.disposition & picture]

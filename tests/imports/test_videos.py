@@ -61,6 +61,14 @@ def test_frames_are_stretched_to_square_pixels(tmp_path, suffix, rotation, turns
     assert notes == [] or "too similar" in notes[0]
 
 
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_titles_in_another_encoding_do_not_matter(tmp_path, suffix):
+    path = write(tmp_path / f"a.{suffix}", {"size": (HEIGHT, 128), "title": "Vidéo"})
+    assert path.read_bytes().count("é".encode()) == 1
+    path.write_bytes(path.read_bytes().replace("é".encode(), b"\xe9!"))
+    assert world.psnr(extracted(path)[0], picture((HEIGHT, 128))) > 38
+
+
 @pytest.mark.parametrize("aspect", [Fraction(40, 1), Fraction(1, 40)])
 def test_impossible_pixels_are_refused(tmp_path, aspect):
     path = write(tmp_path / "a.mkv", {"size": (HEIGHT, 128), "aspect": aspect})

@@ -45,6 +45,8 @@ def write_video(path, *streams, **options):
             stream.options = form.get("options", {"crf": "12", "g": "15", "preset": "ultrafast"})
             if "aspect" in form:
                 stream.codec_context.sample_aspect_ratio = form["aspect"]
+            if "title" in form:
+                container.metadata["title"] = form["title"]
             if "rotation" in form:
                 stream.set_display_rotation(form["rotation"])
             if "disposition" in form:
