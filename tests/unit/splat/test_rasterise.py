@@ -85,10 +85,8 @@ def test_the_background_shows_through():
 
 
 # sizes: whole tiles, and cut ones in both directions
-@pytest.mark.parametrize(
-    ("size_hw", "degree", "num_features"),
-    [((48, 64), 0, 0), ((40, 56), 1, 3), ((37, 51), 2, 9), ((17, 5), 3, 16)],
-)
+@pytest.mark.parametrize("size_hw", [(48, 64), (40, 56), (37, 51), (17, 5)])
+@pytest.mark.parametrize(("degree", "num_features"), [(0, 0), (1, 3), (2, 9), (3, 16)])
 def test_image_agrees_with_reference(size_hw, degree, num_features):
     gaussians, view = random_gaussians(300, seed=degree, degree=3), camera(*size_hw)
     features = np.random.default_rng(1).standard_normal((300, num_features), np.float32)
