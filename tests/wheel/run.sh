@@ -1,6 +1,5 @@
 #!/usr/bin/env bash
 # Build the wheel, install it in a fresh environment, and use it from an empty folder and on results that were moved.
-# RESOLUTION=lowest-direct or highest installs the oldest or newest dependencies that pyproject.toml allows, by uv.
 set -euo pipefail
 project=$(cd "$(dirname "$0")/../.." && pwd)
 work=$(mktemp -d)
@@ -10,12 +9,7 @@ unset PYTHONPATH VIRTUAL_ENV
 export PATH="$work/venv/bin:$PATH"
 pip install --quiet --upgrade pip
 pip wheel --quiet --no-deps --wheel-dir "$work" "$project"
-if [ -n "${RESOLUTION:-}" ]; then
-    pip install --quiet uv
-    uv pip install --quiet --resolution "$RESOLUTION" "$work"/hilsplat-*.whl
-else
-    pip install --quiet --constraint "$project/constraints.txt" "$work"/hilsplat-*.whl
-fi
+pip install --quiet --constraint "$project/constraints.txt" "$work"/hilsplat-*.whl
 
 mkdir "$work/empty folder"
 cd "$work/empty folder"
