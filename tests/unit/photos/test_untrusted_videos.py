@@ -54,5 +54,6 @@ def test_large_frames_are_refused_before_decoding(secret, tmp_path, monkeypatch)
 
 def test_frames_larger_than_stated_are_not_decoded(secret, tmp_path, monkeypatch):
     monkeypatch.setattr(video, "LIMIT", {"max_pixels": "1000"})
-    with pytest.raises(SceneError, match=r"no frame of video .*secret.mp4 can be decoded|secret.mp4 cannot be read"):
+    # PyAV before 19 names no codec that cannot be opened
+    with pytest.raises(SceneError, match=r"of video .*secret.mp4 can be decoded|secret.mp4 cannot be read"):
         video.extract_frames([secret], tmp_path, 3)
