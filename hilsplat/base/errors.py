@@ -37,8 +37,11 @@ def system_error(error: BaseException) -> HilsplatError | None:
     An error about content (`OF_CONTENT`) gets another fix if the machine, not the content, is the reason.
     """
     if isinstance(error, HilsplatError):
-        number = getattr(error.__cause__, "errno", None)
-        if isinstance(error, OF_CONTENT) and isinstance(error.__cause__, OSError) and number in MACHINE:
+        cause = error.__cause__
+        while isinstance(cause, HilsplatError):
+            cause = cause.__cause__
+        number = cause.errno if isinstance(cause, OSError) else None
+        if isinstance(error, OF_CONTENT) and number in MACHINE:
             fix = f"the file may be intact, but it {MACHINE[number]}: correct this, then run again"
             return type(error)(str(error).partition("\n")[0], fix=fix)
         return error

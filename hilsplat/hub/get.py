@@ -194,9 +194,9 @@ def _listing(requested: ModelRequest, revision: str | None) -> Listing:
 def _prepare(requested: ModelRequest, listing: Listing, target: Path) -> Download:
     """Choose the files to download according to the repository's config.json."""
     staging = target.with_name(STAGING.format(name=target.name))
-    if staging.exists() and not is_tagged(staging):
-        raise DownloadError(f"{staging} exists, but is not a download of this version", fix="remove it first")
     tag(staging)
+    if not is_tagged(staging):  # it has files
+        raise DownloadError(f"{staging} exists, but is not a download of this version", fix="remove it first")
     (config,) = listing.require("config.json")
     choice = choose_files(listing, _fetch(listing, config, staging).read_bytes(), requested.variant)
     download = Download(requested, listing, choice, staging, target)
@@ -275,6 +275,8 @@ def _keep_others(former: Path, folder: Path) -> None:
 def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
     """Fetch a file or its missing part; delete the file and raise an error if its digest is wrong."""
     target = staging / file.path
+    if target.is_file() and file.digest_of(target) == file.digest:
+        return target
     if file.cached is None:
         _download(listing, file, staging)
     else:

@@ -2,12 +2,14 @@
 
 import errno
 import hashlib
+import io
 import json
 import re
 import shutil
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from email.utils import formatdate
 from pathlib import Path
 from unittest.mock import Mock
@@ -142,6 +144,23 @@ def test_a_failed_download_is_resumed(hub, waits):
     (resumed,) = hub.ranges(ENCODER)
     assert 0 < int(resumed.removeprefix("bytes=").removesuffix("-")) <= 300_000
     assert visible() == ["sam-vit-base"] and not STAGING.exists()
+
+
+@pytest.mark.parametrize("name", ["CACHEDIR.TAG", "config.json.metadata"])
+def test_a_disk_error_while_fetching_costs_only_that_attempt(hub, monkeypatch, name):
+    opening = io.open
+
+    def failing(path, mode="r", *arguments, **options):
+        if Path(path).name == name and ("w" in mode) == (name == "CACHEDIR.TAG"):
+            raise OSError(errno.EIO, "Input/output error", str(path))
+        return opening(path, mode, *arguments, **options)
+
+    with monkeypatch.context() as patched, suppress(OSError):
+        patched.setattr("io.open", failing)
+        patched.setattr("builtins.open", failing)
+        get_models(["sam-vit-base"])
+    get_models(["sam-vit-base"])
+    assert visible() == ["sam-vit-base"]
 
 
 def test_files_with_another_digest_are_refused_and_deleted(hub, repositories):
