@@ -31,7 +31,7 @@ from hilsplat.workflow.scene_data import Job
 KEPT = ("Nothing to be done", "This was a dry-run")
 """Beginnings of the messages of Snakemake that are printed although they are no warnings."""
 
-PLANNED = frozenset({"run_info", "job_info", "shellcmd"})  # events that a dry run prints
+PLANNED = frozenset({"run_info", "shellcmd"})  # events that a dry run prints as Snakemake does
 
 FOLLOWING = ("At least one job did not complete", "Exiting because a job execution failed")
 """Parts of errors that only repeat that a job has failed."""

@@ -33,7 +33,7 @@ def planned(project, tmp_path_factory) -> str:
         (copy.root / path).touch()
     command = (sys.executable, "-m", "hilsplat", "run", "-n", "--cores", "2", "--config", "paper")
     models = {"HILSPLAT_MODELS": str(copy.root / "none")}  # the estimate needs none
-    result = copy.run(*command, "--", "-p", "--config", "data_root=data", **models)
+    result = copy.run(*command, "--verbose", "--", "-p", "--config", "data_root=data", **models)
     return result.stdout + result.stderr
 
 

@@ -70,9 +70,11 @@ def test_only_outputs_in_the_record_of_the_same_stage_may_be_replaced(photograph
         ownership.require_replaceable([out, photographs], "gaussians", [])
 
 
-def test_outputs_of_a_killed_writer_may_be_replaced(photographs):
+def test_outputs_of_a_killed_writer_may_be_replaced(photographs, tmp_path):
     lock_path(photographs).write_text("unfinished\n")
     ownership.require_replaceable([photographs], "masks", [])
+    lock_path(tmp_path / "table.csv").write_text("unfinished\n")
+    ownership.require_replaceable([tmp_path / "table.csv", photographs], "table", [])
 
 
 @pytest.mark.parametrize("broken", ["", "{", "[]", '{"stage": "masks"}', '{"stage": "masks", "outputs": 3}'])
