@@ -203,6 +203,13 @@ class DeviceError(HilsplatError):
     """This machine does not have the device selected in the settings."""
 
 
+def require_kind(value: object, kind: type, fix: str) -> None:
+    """Raise SettingsError unless an argument of a Python function is a `kind`."""
+    if not isinstance(value, kind):
+        found = f"{type(value).__name__} {str(value)[:80]}"
+        raise SettingsError("an argument has the wrong type", expected=kind.__name__, found=found, fix=fix)
+
+
 @contextmanager
 def foreign(
     what: object,

@@ -602,6 +602,18 @@ def without_effect(plan: Plan, given: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def kept_by_variants(plan: Plan, given: Mapping[str, Any]) -> list[str]:
+    """Return a line for each setting of a configuration's layer that variants of the run set themselves."""
+    changes = {name: plan.run.variants.get(name, {}) for name in plan.run.variant_names()}
+    lines = []
+    for section in (name for name in SECTIONS if given.get(name)):
+        for name in given[section]:
+            if variants := [key for key, changed in changes.items() if name in changed.get(section, ())]:
+                setting = f"{section}.{name}"
+                lines.append(f"{setting} has no effect on variants that set it: {shorten_list(variants)}")
+    return lines
+
+
 def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:
     """Return a line for each scene in `overrides`, `queries` and `sweep_scenes` that is not in the rows.
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import SettingsError, require_kind
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise.api import draw
@@ -49,14 +49,12 @@ def render(
         threads: does not affect the result.
 
     Raises:
-        SettingsError: `camera` is not a camera, the background is not a colour, or there are not as many
-            features as Gaussians.
+        SettingsError: an argument has the wrong type, the background is not a colour, or there are not as
+            many features as Gaussians.
         HilsplatError: Gaussians have non-finite parameters.
     """
-    if not isinstance(camera, Camera):
-        raise SettingsError(
-            f"{camera!r} is not a camera", fix="pass scene.cameras[...], or use scene.render(view)"
-        )
+    require_kind(gaussians, Gaussians, "read them: hilsplat.load_gaussians(...)")
+    require_kind(camera, Camera, "pass scene.cameras[...], or use scene.render(view)")
     if np.shape(background) != (3,):
         raise SettingsError("the background is not a colour", expected="3 numbers", found=repr(background))
     if features is not None and len(features) != len(gaussians):

@@ -246,6 +246,10 @@ def test_a_setting_that_overrides_replace_in_all_scenes_is_refused_or_reported(f
     runs.run([], [], ["-n", "--config", "masks.theta=0.7", "masks.min_area_px=5"])
     runs.run([], [], ["-n", "--config", "overrides.benchmark.masks.theta=0.8"])
     assert len(started) == 2 and not caplog.text
+    variant = ["variants={low: {masks: {theta: 0.6}}}", "main_variants=[low]"]
+    runs.run([], [], ["-n", "--config", *variant, "masks={theta: 0.7, min_area_px: 5}"])
+    (message,) = caplog.messages
+    assert message == "--config: masks.theta has no effect on variants that set it: low"
     methods = ["method={name: langsplat, steps: 50}", "overrides={benchmark: {method: {name: lifted}}}"]
     with pytest.raises(SettingsError, match=r"method\.name has no effect"):
         runs.run([], [], ["-n", "--config", *methods])
