@@ -37,10 +37,10 @@ from hilsplat.hub.catalogue import (
     ModelRequest,
     choose_files,
     networks_of,
+    pins,
     read_cached_listing,
     read_listing,
 )
-from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import WRONG_LENGTH, reason_of, repeated
 from hilsplat.models.folder import ModelFolder, preprocessing_of
 from hilsplat.models.int8 import LARGE_BYTES

@@ -149,7 +149,6 @@ class Plan:
                 )
         # A thousand scenes have tens of thousands of jobs, so settings are resolved and folders read once.
         self.stages_of = functools.cache(lambda *which: run.stages(*which).resolve_auto())
-        self.defaults = {name: getattr(self.stages_of("default", ()), name) for name in SECTIONS}
         self.options: dict[str, Option] = {
             "unit": lambda job: self.row(job).unit,
             "render": lambda job: self.row(job).generated is not None,
@@ -280,7 +279,7 @@ class Plan:
         }
         if files is not None:
             params["files"] = self.data.content(files)
-        models = [name for name in stage.sections.values() if hasattr(self.defaults[name], "model")]
+        models = [name for name in stage.sections.values() if "model" in SECTIONS[name].model_fields]
         return params | ({"model": self.model(models[0])} if models else {})
 
     def _values(self, stage: Stage[..., Any], job: Any, options: Mapping[str, Option]) -> dict[str, Any]:

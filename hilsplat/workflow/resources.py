@@ -26,7 +26,7 @@ from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.memory import MIB
 from hilsplat.baselines import TrainedSettings
-from hilsplat.configuration import StageSettings
+from hilsplat.configuration import SECTIONS, StageSettings
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.models.card import card_problem
 from hilsplat.models.store import RELEASES, model_path, planned_model
@@ -139,8 +139,7 @@ class JobResources:
         """Return the resources of a stage's rule."""
         stage = stage_of(name)
         resources = {"mem_mb": self.memory_mb(name), "runtime": self.minutes(name)}
-        sections = [type(self.plan.defaults[section]) for section in stage.sections.values()]
-        if any("device" in section.model_fields for section in sections):
+        if any("device" in SECTIONS[section].model_fields for section in stage.sections.values()):
             resources["gpu"] = self.gpus(family_of(stage))
         return resources
 

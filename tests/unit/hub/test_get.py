@@ -24,8 +24,8 @@ from hilsplat.base.lineage import sha256_of_file
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.model_check import check_models
 from hilsplat.hub import catalogue, get
+from hilsplat.hub.catalogue import pins
 from hilsplat.hub.get import get_models
-from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import retry_after_s
 from hilsplat.models.store import RELEASES, models_table, real_model
 from tests.loopback_hub import Refusal, git_sha1
