@@ -154,11 +154,10 @@ class RunProgress:
         """Start a job, or restart a failed one."""
         if job.rule in TARGETS:
             return
-        if self.waiting[job.rule] > 0:
-            self.waiting[job.rule] -= 1
-        else:
+        if self.failures.pop(number, None) is not None:
             self.failed -= 1
-            self.failures.pop(number, None)
+        elif self.waiting[job.rule] > 0:
+            self.waiting[job.rule] -= 1
         self.running[number] = job
 
     def fail(self, number: int) -> str:
