@@ -184,6 +184,12 @@ class RunSettings(StageSettings):
         """Accept a single name, because `only=desk` on a command line is a string."""
         return (value,) if isinstance(value, str) else value
 
+    @field_validator("results")
+    @classmethod
+    def _normalised(cls, value: str) -> str:
+        """Remove a final slash, as shells add it, and a leading `./`, because paths are compared as texts."""
+        return str(Path(value))
+
     def every_variant(self) -> list[str]:
         """Return all variants, tabulated or not, once per seed, in order: "default", then `variants`."""
         return [

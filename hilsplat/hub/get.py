@@ -116,8 +116,7 @@ def get_models(
     if revision is not None and len(names) != 1:
         raise DownloadError(f"--revision requires one model, found {len(names)} names", fix="pass one model")
     downloads, reports = [], []
-    for name in names or RECOMMENDED:
-        requested = ModelRequest.named(name, variant)
+    for requested in dict.fromkeys(ModelRequest.named(name, variant) for name in names or RECOMMENDED):
         target = models / requested.name
         with explain_refusals(requested, models):
             listing = _listing(requested, revision)

@@ -15,13 +15,15 @@ import functools
 import json
 import math
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from hilsplat.base.artifacts import read_npz
 from hilsplat.base.cards import cards
-from hilsplat.base.errors import ImageError, ModelError
+from hilsplat.base.errors import ArtifactError, ImageError, ModelError
 from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.memory import MIB
@@ -260,12 +262,11 @@ class JobResources:
 
     def _size(self, row: SceneRow) -> Size:
         """Return the size of a scene from its cameras, or from its settings or image headers."""
-        try:
-            with np.load(Path(self.plan.path(row, "scene")) / "cameras.npz") as cameras:
-                sizes = cameras["size_hw"].astype(np.float64)
-            return Size(len(sizes), float(sizes.prod(axis=1).mean()) / 1e6)
-        except (OSError, ValueError, KeyError):  # the poses stage has not written the file yet
-            stages = self.plan.stages(row)
+        cameras, stages = Path(self.plan.path(row, "scene")) / "cameras.npz", self.plan.stages(row)
+        if cameras.is_file():
+            with suppress(ArtifactError):  # it is damaged, and will be written again
+                sizes = read_npz(cameras, "size_hw")["size_hw"].astype(np.float64)
+                return Size(len(sizes), float(sizes.prod(axis=1).mean()) / 1e6)
         if row.generated:
             return Size(*GENERATORS[row.generated.generator].size(stages))
         files = self.plan.data.image_files(row)

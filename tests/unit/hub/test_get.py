@@ -104,7 +104,8 @@ def test_without_a_name_the_recommended_pair_is_fetched_and_used(hub, repositori
 
 
 def test_a_second_get_transfers_nothing_and_a_new_commit_replaces_all_but_files_of_the_user(hub, changed):
-    get_models(["sam-vit-base"])
+    get_models(["sam-vit-base", SAM])
+    assert len(hub.ranges(ENCODER)) == 1
     hub.asked.clear()
     assert "models/sam-vit-base already exists" in get_models(["sam-vit-base"])
     assert [path for _, path, _ in hub.asked] == [f"/api/models/{SAM}"]

@@ -100,6 +100,8 @@ def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
     assert 'only=["synthetic/two"]' in started[-1]
     runs.run(["./results/synthetic/two/", "./results/synthetic/two/scene/"], [], [])  # as shells complete
     assert 'only=["synthetic/two"]' in started[-1] and started[-1][-1] == "results/synthetic/two/scene"
+    runs.run(["out/synthetic/two/"], [], ["--config", "results=./out/"])
+    assert 'only=["synthetic/two"]' in started[-1]
     runs.run(["synthetic/*", "tables"], [], [])
     assert 'only=["synthetic/*"]' in started[-1] and started[-1][-2:] == ["--", "tables"]
     runs.run(["models/the-two"], [], [])  # a file, although it ends like the name of a scene
