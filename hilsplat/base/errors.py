@@ -86,7 +86,7 @@ def first_line(error: object) -> str:
     """Return the first line of an error from elsewhere, without unprintable characters, or its type."""
     if isinstance(error, ValueError) and hasattr(error, "errors"):  # of pydantic
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        return ": ".join(filter(None, [".".join(map(str, first["loc"])), first["msg"]]))
     lines = str(error)[:1000].strip().splitlines() or [type(error).__name__]
     return "".join(letter for letter in lines[0] if letter.isprintable())[:200]
 

@@ -29,14 +29,15 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
     provenance of the first output, or if a process failed or was killed while writing the outputs.
 
     Raises:
-        ArtifactError: an output is in an artifact, is or contains an input or the working, home or root
-            folder, or exists and is not an earlier output of the stage.
+        ArtifactError: an output is in an artifact, is or contains another output, an input, or the working,
+            home or root folder, or exists and is not an earlier output of the stage.
     """
     recorded, is_unfinished = _recorded_outputs(outputs[0], stage), was_interrupted(outputs[0])
-    sources = [Path(path).resolve() for path in inputs]
-    for out in outputs:
+    sources, paths = [Path(path).resolve() for path in inputs], [out.resolve() for out in outputs]
+    for out, path in zip(outputs, paths, strict=True):
         require_outside_artifacts(out)
-        path = out.resolve()
+        if sum(other.is_relative_to(path) for other in paths) > 1:
+            raise ArtifactError(f"{stage} writes other outputs to {out}, too", fix="choose another name")
         for source in sources:
             if source.is_relative_to(path):
                 what = "is an input" if path == source else f"contains the input {source}"

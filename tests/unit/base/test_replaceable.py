@@ -97,6 +97,12 @@ def test_an_input_is_never_an_output(photographs, tmp_path):
         ownership.require_replaceable([tmp_path], "poses", [photographs])
 
 
+@pytest.mark.parametrize("names", [("table.md", "table.md"), ("fit", "fit/gaussians.ply")])
+def test_outputs_of_a_stage_do_not_replace_each_other(tmp_path, names):
+    with pytest.raises(ArtifactError, match=f"table writes other outputs to .*{names[0]}, too"):
+        ownership.require_replaceable([tmp_path / name for name in names], "table", [])
+
+
 def test_the_working_and_the_home_folder_are_never_outputs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for out, name in ((Path(), "working"), (tmp_path.parent, "working"), (Path.home(), "home")):
