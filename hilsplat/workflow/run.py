@@ -355,8 +355,8 @@ def _recover(command: Sequence[str], results: Path) -> None:
                 f"another Snakemake process is running in {Path.cwd()}", fix="let it finish, or stop it"
             ) from error
     remove_leftovers(results)
-    is_elsewhere = any(marker.read_text(encoding="utf-8") != socket.gethostname() for marker in markers)
-    if is_elsewhere and "--unlock" not in command:
+    hosts = {marker.read_text(encoding="utf-8") for marker in markers} - {""}  # "": its disk was full
+    if hosts - {socket.gethostname()} and "--unlock" not in command:
         logger.warning("another machine may be running this workflow; if not, add once: -- --unlock")
         return
     try:

@@ -160,7 +160,9 @@ def test_the_locks_of_a_dead_run_are_removed_once(folder, started, unlocked):
     leave_marker()
     runs.run([], [], [])
     assert unlocked == ["unlock"]
-    assert list(runs.STATE.glob("run-*")) == []
+    (runs.STATE / "run-00000002").touch()  # a full disk
+    runs.run([], [], [])
+    assert unlocked == ["unlock"] * 2 and list(runs.STATE.glob("run-*")) == []
 
 
 def leave_marker(host: str = "") -> None:
