@@ -1,6 +1,5 @@
 """The configuration of a run: settings of each stage, variants, seeds, scenes and tables."""
 
-import difflib
 import json
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -126,10 +125,7 @@ def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -
             section: Any = model
             for part in path[:-1]:
                 section = section.model_fields[part].annotation
-            known = sorted(section.model_fields)
-            near = difflib.get_close_matches(path[-1], known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
-            lines.append(f"{key}: unknown key; {hint}")
+            lines.append(f"{key}: unknown key; {nearest(path[-1], sorted(section.model_fields))}")
         else:
             found = json.dumps(problem.get("input"), default=str)
             found = found if len(found) <= MAX_SHOWN else f"{found[:MAX_SHOWN]}..."
@@ -183,6 +179,12 @@ class RunSettings(StageSettings):
     def _names(cls, value: Any) -> Any:
         """Accept a single name, because `only=desk` on a command line is a string."""
         return (value,) if isinstance(value, str) else value
+
+    @field_validator("results")
+    @classmethod
+    def _normalised(cls, value: str) -> str:
+        """Remove a final slash, as shells add it, and a leading `./`, because paths are compared as texts."""
+        return str(Path(value))
 
     def every_variant(self) -> list[str]:
         """Return all variants, tabulated or not, once per seed, in order: "default", then `variants`."""

@@ -29,6 +29,7 @@ from hilsplat.base.errors import (
     MisalignedArtifactError,
     SceneError,
     SettingsError,
+    require_kind,
     shorten_list,
 )
 from hilsplat.base.levels import LEVELS
@@ -49,6 +50,7 @@ from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply, save_ply
 
 FRAMES = 60  # maximum number of frames of videos, as in `hilsplat new`
+OPEN = "open it: hilsplat.load_scene(...)"
 GIVEN = "given"  # kind of Gaussians that `link` stored, in the JSON file beside the PLY
 
 logger = logging.getLogger(__name__)
@@ -183,6 +185,7 @@ def fit(
         SceneError: the scene has no training views, or all Gaussians became transparent.
         DeviceError: `device="cuda"` cannot be used.
     """
+    require_kind(scene, Scene, OPEN)
     _require_seed(seed)
     steps = {} if iterations is None else {"iterations": iterations, "steps_per_view": iterations}
     section = validated("gaussians", steps | settings)
@@ -201,7 +204,10 @@ def load_gaussians(path: Path | str, scene: Scene | None = None) -> Gaussians:
     Raises:
         ArtifactError: the file is missing, or is not a 3DGS PLY.
     """
-    return load_ply(Path(path)) if scene is None else import_gaussians(Path(path), scene)[0]
+    if scene is None:
+        return load_ply(Path(path))
+    require_kind(scene, Scene, OPEN)
+    return import_gaussians(Path(path), scene)[0]
 
 
 def segment(
@@ -226,6 +232,7 @@ def segment(
         SceneError: the scene has no training views.
         ModelError: the model is missing or incomplete.
     """
+    require_kind(scene, Scene, OPEN)
     segmenter = AUTO if model == AUTO else "sam"
     chosen = validated("masks", {"segmenter": segmenter, "model": str(model), **settings})
     section, views = resolve_auto(chosen), train_views(scene)
@@ -268,6 +275,8 @@ def link(
         MisalignedArtifactError: there are no masks, or some are not those of the scene's training views.
         ModelError: the model is missing or incomplete.
     """
+    require_kind(scene, Scene, OPEN)
+    require_kind(gaussians, Gaussians, "pass those of hilsplat.fit or load_gaussians")
     section, number = validated("semantic_tree", settings), _threads(threads)
     clip = resolve_auto(validated("clip", {"model": str(model), "crops": "nodes"}))
     views = train_views(scene)

@@ -44,12 +44,12 @@ class Section(BaseModel):
     @property
     def uses_model(self) -> bool:
         """Whether the stage runs the model in the setting `model`."""
-        return False
+        return "model" in type(self).model_fields
 
     @property
     def uses_card(self) -> bool:
         """Whether the stage uses an NVIDIA card if there is one that works."""
-        return False
+        return getattr(self, "device", "cpu") != "cpu"
 
 
 def _takes(annotation: Any, kind: type) -> bool:
@@ -157,10 +157,6 @@ class GaussiansSettings(Section):
         """Value of `device`."""
         return self.device
 
-    @property
-    def uses_card(self) -> bool:
-        return self.device != "cpu"
-
 
 class MasksSettings(Section):
     """Masks of each view, at three levels."""
@@ -250,7 +246,7 @@ class MasksSettings(Section):
 
     @property
     def uses_card(self) -> bool:
-        return self.uses_model and self.device != "cpu"
+        return self.uses_model and super().uses_card
 
 
 class CoverageTreeSettings(Section):
@@ -293,14 +289,6 @@ class ClipSettings(Section):
         "black", "pixels of a crop outside its mask: painted black, or kept", origin="LangSplat: black"
     )
     batch: int = knob(1, "crops per network call on a CPU, where more are no faster", ge=1, le=4096)
-
-    @property
-    def uses_model(self) -> bool:
-        return True
-
-    @property
-    def uses_card(self) -> bool:
-        return self.device != "cpu"
 
 
 class ContributionsSettings(Section):

@@ -222,21 +222,15 @@ def metadata_of(hint: Any) -> tuple[Any, ...]:
     return metadata or tuple(value for part in get_args(hint) for value in getattr(part, "__metadata__", ()))
 
 
-def models_of(sections: Sequence[Section]) -> dict[str, Path]:
-    """Return the model folder of settings that use one, if it exists; a stage reports a missing folder."""
-    for section in sections:
-        if section.uses_model and (folder := model_path(getattr(section, "model"))).is_dir():  # noqa: B009
-            return {"model": folder}
-    return {}
-
-
 @contextmanager
 def _recorded(stage: Stage[..., Any], arguments: Mapping[str, Any]) -> Iterator[None]:
     """Lock the output, check inputs and disk space, and write provenance when the call ends."""
     sections = {section: arguments[name] for name, section in stage.sections.items()}
     given = {name: arguments[name] for name in stage.inputs if arguments[name] is not None}
+    named = [model_path(section.model) for section in sections.values() if section.uses_model]
+    models = [folder for folder in named if folder.is_dir()]  # the stage reports a missing folder
     extra = stage.reads(arguments)
-    inputs = {**given, **models_of([*sections.values()]), **extra.inputs}
+    inputs = {**given, **dict(zip(["model"], models, strict=False)), **extra.inputs}
     out = arguments["out"]
     beside = (*(arguments[name] for name in stage.outputs[1:]), *stage.beside(out))
     # A picture has a PDF beside it, and a field a report; before the first run, such a file is the user's.

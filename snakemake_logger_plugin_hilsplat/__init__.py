@@ -1,7 +1,7 @@
 """Snakemake logger plugin that shows the progress of a run instead of Snakemake's block of lines per job.
 
 `profiles/default` enables it. With --verbose, --quiet or another --logger, Snakemake's own output is
-unchanged. A dry run prints its jobs, and a table that estimates the run's time and memory.
+unchanged. A dry run prints a line per job, and a table that estimates the run's time and memory.
 """
 
 import logging
@@ -37,16 +37,22 @@ class LogHandler(LogHandlerBase):
         try:
             if self.display is not None:
                 self.display.show(record)
-            elif self._is_printed(record) and (text := self.format(record)):
+            elif text := self._text(record):
                 print(visible(text), file=self.stream, flush=True)
             if self.is_dry and getattr(record, "event", None) == "job_info":
                 self._count(record)
         except Exception:
             self.handleError(record)
 
-    def _is_printed(self, record: logging.LogRecord) -> bool:
-        is_filtered = self.is_dry and not self.common_settings.verbose
-        return not is_filtered or is_shown(record) or getattr(record, "event", None) in PLANNED
+    def _text(self, record: logging.LogRecord) -> str:
+        """Return what is printed for a record of a run without a progress line; empty for nothing."""
+        event, facts = getattr(record, "event", None), record.__dict__
+        if not self.is_dry or self.common_settings.verbose or event in PLANNED or is_shown(record):
+            return self.format(record)
+        if event != "job_info":
+            return ""
+        places, reason = "/".join(facts["wildcards"].values()), facts["reason"].partition(": ")[0]
+        return ": ".join(filter(None, [f"rule {facts['rule_name']}", places, reason]))
 
     def _count(self, record: logging.LogRecord) -> None:
         """Add a job to the estimate of a dry run; the Snakefile has already set the plan."""

@@ -37,8 +37,11 @@ def system_error(error: BaseException) -> HilsplatError | None:
     An error about content (`OF_CONTENT`) gets another fix if the machine, not the content, is the reason.
     """
     if isinstance(error, HilsplatError):
-        number = getattr(error.__cause__, "errno", None)
-        if isinstance(error, OF_CONTENT) and isinstance(error.__cause__, OSError) and number in MACHINE:
+        cause = error.__cause__
+        while isinstance(cause, HilsplatError):
+            cause = cause.__cause__
+        number = cause.errno if isinstance(cause, OSError) else None
+        if isinstance(error, OF_CONTENT) and number in MACHINE:
             fix = f"the file may be intact, but it {MACHINE[number]}: correct this, then run again"
             return type(error)(str(error).partition("\n")[0], fix=fix)
         return error
@@ -83,7 +86,7 @@ def first_line(error: object) -> str:
     """Return the first line of an error from elsewhere, without unprintable characters, or its type."""
     if isinstance(error, ValueError) and hasattr(error, "errors"):  # of pydantic
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        return ": ".join(filter(None, [".".join(map(str, first["loc"])), first["msg"]]))
     lines = str(error)[:1000].strip().splitlines() or [type(error).__name__]
     return "".join(letter for letter in lines[0] if letter.isprintable())[:200]
 
@@ -198,6 +201,13 @@ class MemoryLimitError(HilsplatError):
 
 class DeviceError(HilsplatError):
     """This machine does not have the device selected in the settings."""
+
+
+def require_kind(value: object, kind: type, fix: str) -> None:
+    """Raise SettingsError unless an argument of a Python function is a `kind`."""
+    if not isinstance(value, kind):
+        found = f"{type(value).__name__} {str(value)[:80]}"
+        raise SettingsError("an argument has the wrong type", expected=kind.__name__, found=found, fix=fix)
 
 
 @contextmanager

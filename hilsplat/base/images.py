@@ -176,10 +176,13 @@ def read_mask(path: Path) -> UInt8[np.ndarray, "H W"]:
         ImageError: the file is missing or not an image, or has several classes, as colours or as ids.
     """
     with opened_image(path, "mask") as image:
-        if image.mode.startswith("I"):
+        if image.mode.startswith(("I", "F")):
             values = np.asarray(image)
-            grey = _eight_bits(values) if values.max() > 255 else values.astype(np.uint8)
-        elif image.mode in ("1", "L", "F") and not image.has_transparency_data:
+            if (values != np.rint(values)).any():
+                raise ValueError("its grey values are fractions of unknown range")
+            is_byte = values.min() >= 0 and values.max() <= 255
+            grey = values.astype(np.uint8) if is_byte else _eight_bits(values)
+        elif image.mode in ("1", "L") and not image.has_transparency_data:
             grey = np.asarray(image.convert("L"))
         else:
             rgba = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB").convert("RGBA"))

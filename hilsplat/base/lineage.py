@@ -52,8 +52,12 @@ def sha256_of_json(value: Any) -> str:
 
 
 def sha256_of_file(path: Path) -> str:
-    with regular(Path(path)).open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    try:
+        with regular(Path(path)).open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        error.filename = str(path)  # errors of reading name no file
+        raise
 
 
 def sha256_of_path(path: Path) -> str:

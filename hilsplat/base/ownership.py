@@ -26,17 +26,18 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
     """Check that a stage can write its outputs without overwriting unrelated data.
 
     An existing file or folder may be replaced if it is empty, if the same stage wrote it according to the
-    provenance of the first output, or if a process was killed while writing it.
+    provenance of the first output, or if a process failed or was killed while writing the outputs.
 
     Raises:
-        ArtifactError: an output is in an artifact, is or contains an input or the working, home or root
-            folder, or exists and is not an earlier output of the stage.
+        ArtifactError: an output is in an artifact, is or contains another output, an input, or the working,
+            home or root folder, or exists and is not an earlier output of the stage.
     """
-    recorded = _recorded_outputs(outputs[0], stage)
-    sources = [Path(path).resolve() for path in inputs]
-    for out in outputs:
+    recorded, is_unfinished = _recorded_outputs(outputs[0], stage), was_interrupted(outputs[0])
+    sources, paths = [Path(path).resolve() for path in inputs], [out.resolve() for out in outputs]
+    for out, path in zip(outputs, paths, strict=True):
         require_outside_artifacts(out)
-        path = out.resolve()
+        if sum(other.is_relative_to(path) for other in paths) > 1:
+            raise ArtifactError(f"{stage} writes other outputs to {out}, too", fix="choose another name")
         for source in sources:
             if source.is_relative_to(path):
                 what = "is an input" if path == source else f"contains the input {source}"
@@ -46,7 +47,7 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
                 raise ArtifactError(
                     f"output {out} is or contains the {name} folder", fix="choose a new file or folder"
                 )
-        if _is_something(out) and path not in recorded and not was_interrupted(out):
+        if _is_something(out) and path not in recorded and not is_unfinished:
             raise _foreign(out, stage, f"a new path, or an earlier output of {stage} with its provenance")
 
 

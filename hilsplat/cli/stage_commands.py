@@ -5,9 +5,10 @@ from collections.abc import Callable
 from typing import Annotated, Any, get_args, get_origin
 
 import typer
+from pydantic import TypeAdapter
 
 from hilsplat.base.artifacts import parse_json
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import SettingsError, first_line
 from hilsplat.base.plugins import entry_points
 from hilsplat.cli.common import app, cache_app, datasets_app, echo, models_app, start_logging
 from hilsplat.configuration import parse_section, resolve_auto
@@ -46,7 +47,9 @@ def command_of(stage: Stage[..., Any]) -> Callable[..., None]:
     hints |= unused
     defaults = {name: parameter.default for name, parameter in inspect.signature(function).parameters.items()}
     defaults |= dict.fromkeys(stage.sections, "{}") | dict.fromkeys(unused)
-    defaults |= {name: "[]" if _kind_of(stage.hints[name]) is list else "{}" for name in stage.json}
+    defaults |= {
+        name: "[]" if get_origin(get_args(stage.hints[name])[0]) is list else "{}" for name in stage.json
+    }
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=hint)
@@ -62,23 +65,13 @@ def _option_of(hint: Any) -> Any:
     return next(value for value in metadata_of(hint) if isinstance(value, type(typer.Option())))
 
 
-def _kind_of(hint: Any) -> type:
-    kind = get_origin(get_args(hint)[0])
-    assert isinstance(kind, type), hint
-    return kind
-
-
 def _json_of(name: str, text: str, hint: Any) -> Any:
-    """Parse a JSON option that must be a list or dict of strings; raise SettingsError otherwise."""
-    option, kind = f"--{name.replace('_', '-')}", _kind_of(hint)
+    """Parse a JSON option; raise SettingsError if the value doesn't have the type of the hint."""
     try:
-        value = parse_json(text)
+        return TypeAdapter(get_args(hint)[0]).validate_python(parse_json(text), strict=True)
     except ValueError as error:
-        raise SettingsError(f"{option} is not JSON: {error}", found=text[:80]) from error
-    texts = value.values() if isinstance(value, dict) else value
-    if not isinstance(value, kind) or not all(isinstance(item, str) for item in texts):
-        raise SettingsError(f"{option} is not a JSON {kind.__name__} of strings", found=text[:80])
-    return value
+        problem = f"--{name.replace('_', '-')} is not JSON of type {get_args(hint)[0]}: {first_line(error)}"
+        raise SettingsError(problem, found=text[:80]) from error
 
 
 for _name, _group in entry_points("hilsplat.commands").items():

@@ -1,8 +1,10 @@
-"""Model names, the files in hub repositories, and the choice of the files that a model needs."""
+"""Model names, the files in hub repositories with their pins, and the choice of the files of a model."""
 
+import csv
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import huggingface_hub
@@ -15,7 +17,6 @@ from huggingface_hub.utils.sha import git_hash
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import DownloadError, first_line
 from hilsplat.base.lineage import sha256_of_file
-from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import repeated
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
 from hilsplat.models.store import RELEASES, Release
@@ -32,6 +33,30 @@ OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled
 """Errors raised if the hub cannot be reached."""
 WHOLES = ("onnx/model", "model")
 """Possible paths, without `.onnx`, of a network that contains both halves of a CLIP model."""
+
+
+PINS = Path(__file__).with_name("pins.tsv")
+"""Commits and digests of the released models, from public sources (docs/models.md)."""
+
+
+@dataclass(frozen=True)
+class Pin:
+    """The commit of a repository that is downloaded by default."""
+
+    commit: str
+    sha256: dict[str, str]  # digests of files whose digest is known, by path
+
+
+@cache
+def pins() -> dict[str, Pin]:
+    """Return the pinned commit of each repository of a released model."""
+    by_repository: dict[str, Pin] = {}
+    with PINS.open(encoding="utf-8", newline="") as stream:
+        for row in csv.DictReader(stream, delimiter="\t"):
+            pin = by_repository.setdefault(row["repository"], Pin(row["commit"], {}))
+            if row["path"]:
+                pin.sha256[row["path"]] = row["sha256"]
+    return by_repository
 
 
 @dataclass(frozen=True)

@@ -37,10 +37,10 @@ from hilsplat.hub.catalogue import (
     ModelRequest,
     choose_files,
     networks_of,
+    pins,
     read_cached_listing,
     read_listing,
 )
-from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import WRONG_LENGTH, reason_of, repeated
 from hilsplat.models.folder import ModelFolder, preprocessing_of
 from hilsplat.models.int8 import LARGE_BYTES
@@ -116,8 +116,7 @@ def get_models(
     if revision is not None and len(names) != 1:
         raise DownloadError(f"--revision requires one model, found {len(names)} names", fix="pass one model")
     downloads, reports = [], []
-    for name in names or RECOMMENDED:
-        requested = ModelRequest.named(name, variant)
+    for requested in dict.fromkeys(ModelRequest.named(name, variant) for name in names or RECOMMENDED):
         target = models / requested.name
         with explain_refusals(requested, models):
             listing = _listing(requested, revision)
@@ -194,9 +193,9 @@ def _listing(requested: ModelRequest, revision: str | None) -> Listing:
 def _prepare(requested: ModelRequest, listing: Listing, target: Path) -> Download:
     """Choose the files to download according to the repository's config.json."""
     staging = target.with_name(STAGING.format(name=target.name))
-    if staging.exists() and not is_tagged(staging):
-        raise DownloadError(f"{staging} exists, but is not a download of this version", fix="remove it first")
     tag(staging)
+    if not is_tagged(staging):  # it has files
+        raise DownloadError(f"{staging} exists, but is not a download of this version", fix="remove it first")
     (config,) = listing.require("config.json")
     choice = choose_files(listing, _fetch(listing, config, staging).read_bytes(), requested.variant)
     download = Download(requested, listing, choice, staging, target)
@@ -275,6 +274,8 @@ def _keep_others(former: Path, folder: Path) -> None:
 def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
     """Fetch a file or its missing part; delete the file and raise an error if its digest is wrong."""
     target = staging / file.path
+    if target.is_file() and file.digest_of(target) == file.digest:
+        return target
     if file.cached is None:
         _download(listing, file, staging)
     else:

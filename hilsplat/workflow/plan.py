@@ -149,7 +149,6 @@ class Plan:
                 )
         # A thousand scenes have tens of thousands of jobs, so settings are resolved and folders read once.
         self.stages_of = functools.cache(lambda *which: run.stages(*which).resolve_auto())
-        self.defaults = {name: getattr(self.stages_of("default", ()), name) for name in SECTIONS}
         self.options: dict[str, Option] = {
             "unit": lambda job: self.row(job).unit,
             "render": lambda job: self.row(job).generated is not None,
@@ -280,7 +279,7 @@ class Plan:
         }
         if files is not None:
             params["files"] = self.data.content(files)
-        models = [name for name in stage.sections.values() if hasattr(self.defaults[name], "model")]
+        models = [name for name in stage.sections.values() if "model" in SECTIONS[name].model_fields]
         return params | ({"model": self.model(models[0])} if models else {})
 
     def _values(self, stage: Stage[..., Any], job: Any, options: Mapping[str, Option]) -> dict[str, Any]:
@@ -599,6 +598,18 @@ def without_effect(plan: Plan, given: Mapping[str, Any]) -> list[str]:
                 scope = max(replacing, key=lambda key: name in plan.run.overrides[key][section])
                 setting = f"{section}.{name}"
                 lines.append(f"{setting} has no effect, because overrides.{scope}.{setting} replaces it")
+    return lines
+
+
+def kept_by_variants(plan: Plan, given: Mapping[str, Any]) -> list[str]:
+    """Return a line for each setting of a configuration's layer that variants of the run set themselves."""
+    changes = {name: plan.run.variants.get(name, {}) for name in plan.run.variant_names()}
+    lines = []
+    for section in (name for name in SECTIONS if given.get(name)):
+        for name in given[section]:
+            if variants := [key for key, changed in changes.items() if name in changed.get(section, ())]:
+                setting = f"{section}.{name}"
+                lines.append(f"{setting} has no effect on variants that set it: {shorten_list(variants)}")
     return lines
 
 

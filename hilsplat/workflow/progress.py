@@ -31,7 +31,7 @@ from hilsplat.workflow.scene_data import Job
 KEPT = ("Nothing to be done", "This was a dry-run")
 """Beginnings of the messages of Snakemake that are printed although they are no warnings."""
 
-PLANNED = frozenset({"run_info", "job_info", "shellcmd"})  # events that a dry run prints
+PLANNED = frozenset({"run_info", "shellcmd"})  # events that a dry run prints as Snakemake does
 
 FOLLOWING = ("At least one job did not complete", "Exiting because a job execution failed")
 """Parts of errors that only repeat that a job has failed."""
@@ -154,11 +154,10 @@ class RunProgress:
         """Start a job, or restart a failed one."""
         if job.rule in TARGETS:
             return
-        if self.waiting[job.rule] > 0:
-            self.waiting[job.rule] -= 1
-        else:
+        if self.failures.pop(number, None) is not None:
             self.failed -= 1
-            self.failures.pop(number, None)
+        elif self.waiting[job.rule] > 0:
+            self.waiting[job.rule] -= 1
         self.running[number] = job
 
     def fail(self, number: int) -> str:

@@ -7,9 +7,10 @@ an unfinished output of a killed job, and it detects nothing if its metadata is 
 import json
 import shlex
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import dropwhile
 from pathlib import Path
+from typing import Any
 
 from hilsplat.base.artifacts import RUN, provenance_path, run_command
 from hilsplat.base.atomic import was_interrupted
@@ -24,7 +25,9 @@ from hilsplat.base.lineage import (
 )
 from hilsplat.base.progress import track
 from hilsplat.models.store import model_digest
+from hilsplat.stage import Stage
 from hilsplat.stages import all_stages
+from hilsplat.workflow import targets
 from hilsplat.workflow.plan import Plan, words_of
 from hilsplat.workflow.scene_data import VariantJob, of_variant
 
@@ -148,26 +151,39 @@ class Records:
             seed = self.plan.seed(stage, job) if "seed" in stage.hints else None
             if record.seed != seed:
                 yield f"it was made with seed {record.seed}, not {seed}"
-            for name in (name for name in OPTIONS if name in stage.hints and record.command):
-                words = shlex.split(words_of(stage, {name: self.plan.options[name](job)}))
-                after = [*dropwhile(f"--{name}".__ne__, record.command)]
-                if after[: max(1, len(words))] != words:
-                    yield f"it was made with another --{name}"
+            options = {name: self.plan.options[name](job) for name in OPTIONS if name in stage.hints}
+            yield from self._other_options(stage, record, options)
         try:
             code = stage.code_digest(record.plugins)
         except HilsplatError:  # this version does not have the reader
             code = ""
         if code != record.code:
             yield "it was made by different code"
-        written = self._written_results(artifact, record)
+        written, paths = self._written_results(artifact, record), set[str]()
         for name, read in record.inputs.items():
             files = {read.path: read.sha256} if read.files is None else read.files
             for file, digest in files.items():
                 inside = Path(file).is_relative_to(written)
                 path = self.results / Path(file).relative_to(written) if inside else Path(file)
+                paths |= {str(path)} if inside else set()
                 known = self._digest(path) if self.every_byte else self._known_digest(name, path)
                 if known != digest and (known is not None or (self.every_byte and inside)):
                     yield f"its input {name} {'is missing' if known is None else 'has changed'}: {path}"
+        if self.plan is not None and str(artifact) in targets.tables(self.plan):
+            if paths != {*targets.scores(self.plan, artifact.stem)}:
+                yield "it was made from other scores"
+            yield from self._other_options(stage, record, {"labels": self.plan.names(None)})
+
+    @staticmethod
+    def _other_options(
+        stage: Stage[..., Any], record: Provenance, options: Mapping[str, Any]
+    ) -> Iterator[str]:
+        """Yield a difference for each option that the recorded command, if any, does not have."""
+        for name in options if record.command else ():
+            words = shlex.split(words_of(stage, {name: options[name]}))
+            after = [*dropwhile(f"--{name}".__ne__, record.command)]
+            if after[: max(1, len(words))] != words:
+                yield f"it was made with another --{name}"
 
     def _written_results(self, artifact: Path, record: Provenance) -> Path:
         """Return the results folder as an artifact's writer named it, given by the option `--out`."""

@@ -15,18 +15,20 @@ import functools
 import json
 import math
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from hilsplat.base.artifacts import read_npz
 from hilsplat.base.cards import cards
-from hilsplat.base.errors import ImageError, ModelError
+from hilsplat.base.errors import ArtifactError, ImageError, ModelError
 from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.memory import MIB
 from hilsplat.baselines import TrainedSettings
-from hilsplat.configuration import StageSettings
+from hilsplat.configuration import SECTIONS, StageSettings
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.models.card import card_problem
 from hilsplat.models.store import RELEASES, model_path, planned_model
@@ -139,8 +141,7 @@ class JobResources:
         """Return the resources of a stage's rule."""
         stage = stage_of(name)
         resources = {"mem_mb": self.memory_mb(name), "runtime": self.minutes(name)}
-        sections = [type(self.plan.defaults[section]) for section in stage.sections.values()]
-        if any("device" in section.model_fields for section in sections):
+        if any("device" in SECTIONS[section].model_fields for section in stage.sections.values()):
             resources["gpu"] = self.gpus(family_of(stage))
         return resources
 
@@ -261,12 +262,11 @@ class JobResources:
 
     def _size(self, row: SceneRow) -> Size:
         """Return the size of a scene from its cameras, or from its settings or image headers."""
-        try:
-            with np.load(Path(self.plan.path(row, "scene")) / "cameras.npz") as cameras:
-                sizes = cameras["size_hw"].astype(np.float64)
-            return Size(len(sizes), float(sizes.prod(axis=1).mean()) / 1e6)
-        except (OSError, ValueError, KeyError):  # the poses stage has not written the file yet
-            stages = self.plan.stages(row)
+        cameras, stages = Path(self.plan.path(row, "scene")) / "cameras.npz", self.plan.stages(row)
+        if cameras.is_file():
+            with suppress(ArtifactError):  # it is damaged, and will be written again
+                sizes = read_npz(cameras, "size_hw")["size_hw"].astype(np.float64)
+                return Size(len(sizes), float(sizes.prod(axis=1).mean()) / 1e6)
         if row.generated:
             return Size(*GENERATORS[row.generated.generator].size(stages))
         images = self.plan.data.photographs(row)

@@ -32,7 +32,7 @@ from hilsplat.base.removal import delete
 from hilsplat.configuration import CONFIG, SECTIONS, first_unusable, merged_config, parse_run, read_config
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, is_pattern, matches_of, read_sheet
 from hilsplat.workflow.estimate import forecasts
-from hilsplat.workflow.plan import Plan, without_effect
+from hilsplat.workflow.plan import Plan, kept_by_variants, without_effect
 from hilsplat.workflow.records import outdated
 from hilsplat.workflow.summary import summary
 
@@ -190,8 +190,11 @@ def run(
     for layer in (_edited(), *map(read_config, configs)):
         for line in without_effect(plan, layer):
             logger.warning("%s", line)
-    for line in (line for layer in overrides for line in without_effect(plan, layer)):
-        raise SettingsError(f"--config: {line}", fix="set the other key instead")
+    for layer in overrides:
+        for line in without_effect(plan, layer):
+            raise SettingsError(f"--config: {line}", fix="set the other key instead")
+        for line in kept_by_variants(plan, layer):
+            logger.warning("--config: %s", line)
     command = ["snakemake", "--snakefile", str(_snakefile(configs)), *others]
     command += ["--configfile", *map(str, configs)] if configs else []
     command += ["--config", *given.config] if given.config else []
@@ -352,8 +355,8 @@ def _recover(command: Sequence[str], results: Path) -> None:
                 f"another Snakemake process is running in {Path.cwd()}", fix="let it finish, or stop it"
             ) from error
     remove_leftovers(results)
-    is_elsewhere = any(marker.read_text(encoding="utf-8") != socket.gethostname() for marker in markers)
-    if is_elsewhere and "--unlock" not in command:
+    hosts = {marker.read_text(encoding="utf-8") for marker in markers} - {""}  # "": its disk was full
+    if hosts - {socket.gethostname()} and "--unlock" not in command:
         logger.warning("another machine may be running this workflow; if not, add once: -- --unlock")
         return
     try:

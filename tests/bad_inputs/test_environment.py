@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base.errors import ImageError, system_error
+from hilsplat.base.errors import ImageError, ModelError, system_error
 from hilsplat.base.images import read_image
 from tests.bad_inputs.test_bad_inputs import CONTRIBUTE, MASKS
 
@@ -65,8 +65,11 @@ def test_an_image_that_the_machine_cannot_read_is_not_called_damaged(tmp_path: P
     monkeypatch.setattr("PIL.Image.open", refuse)
     with pytest.raises(ImageError, match="replace it with an intact copy") as refusal:
         read_image(tmp_path / "a.png")
-    text = str(system_error(refusal.value))
-    assert "a.png cannot be read" in text and "the file may be intact" in text and "replace" not in text
+    repeated = ModelError("a.png cannot be read: of a model")
+    repeated.__cause__ = refusal.value
+    for error in (refusal.value, repeated):
+        text = str(system_error(error))
+        assert "a.png cannot be read" in text and "the file may be intact" in text and "replace" not in text
 
 
 def test_more_threads_than_cores_cost_nothing(project: Path):

@@ -748,6 +748,7 @@ def mask(path: Path) -> np.ndarray:
     image = opened(path)
     if image.mode.startswith("I"):
         values = np.asarray(image).astype(np.int64)
+        require(values.min() >= 0, "range")
         grey = (np.rint(values / 257) if values.max() > 255 else values).astype(np.uint8)
     else:
         rgba = np.asarray(image.convert("RGBA")).astype(np.int64)

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
+from hilsplat.base.errors import ImageError
 from hilsplat.base.images import image_size_hw, read_image, read_mask
 from tests.conftest import PROJECT
 from tests.imports import analytic_world as world
@@ -195,3 +196,16 @@ def test_masks_are_read_as_stored(tmp_path):
     mask[10:20, 5:50] = 255
     Image.fromarray(mask).save(tmp_path / "a.png", exif=exif(6))
     np.testing.assert_array_equal(read_mask(tmp_path / "a.png"), mask)
+
+
+def test_masks_may_have_any_type_of_numbers_but_neither_negative_numbers_nor_fractions(tmp_path):
+    mask = np.zeros((HEIGHT, WIDTH), np.float32)
+    for value in (255, -1, 0.9, np.nan):
+        mask[10:20, 5:50] = value
+        for kind in (np.int32, np.float32) if value in (255, -1) else (np.float32,):
+            Image.fromarray(mask.astype(kind)).save(tmp_path / "a.tif")
+            if value == 255:
+                np.testing.assert_array_equal(read_mask(tmp_path / "a.tif"), mask)
+            else:
+                with pytest.raises(ImageError, match="fractions" if value != -1 else "-1 to 0, do not fit"):
+                    read_mask(tmp_path / "a.tif")

@@ -4,7 +4,7 @@ import csv
 import re
 from pathlib import Path
 
-from hilsplat.hub.pins import pins
+from hilsplat.hub.catalogue import pins
 from hilsplat.models.store import RELEASES
 from tests.conftest import PROJECT
 

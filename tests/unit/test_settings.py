@@ -39,7 +39,7 @@ from hilsplat.stage import Seed
         ({"masks": {"predicted_iou_min": float("inf")}}, r"masks\.predicted_iou_min"),
         ({"masks": {"predicted_iou_min": float("nan")}}, r"masks\.predicted_iou_min"),
         ({"masks": {"graph_scales": [float("-inf")] * 3}}, r"masks\.graph_scales"),
-        ({"method": {"name": "lifted", "steps": 1}}, r"method\.steps: unknown key; known keys: name"),
+        ({"method": {"name": "lifted", "steps": 1}}, r"method\.steps: unknown key; one of name"),
         (
             {"variants": {"x": {"method": {"name": "opengaussian", "codebok": [1, 1]}}}},
             r"variants\.x\.method\.codebok: unknown key; did you mean 'codebook'\?",

@@ -104,7 +104,7 @@ rule mine:
 
 
 def test_the_results_folder_is_one_setting(clone: Project) -> None:
-    printed = clone.snakemake("-n", "-p", "--config", "results=out put").stdout
+    printed = clone.snakemake("-n", "-p", "--verbose", "--config", "results=out put").stdout
     assert "output: out put/" in printed and "output: results/" not in printed
     commands = [line for line in printed.splitlines() if "python -m hilsplat" in line]
     assert not [line for line in commands if " results/" in line]

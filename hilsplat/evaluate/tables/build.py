@@ -75,6 +75,8 @@ def run_table(
     write_text(out.with_suffix(".tex"), as_latex(table))
     write_text(out.with_suffix(".html"), as_html(table))
     write_csv(out, *csv_rows(table))
+    if scores and all(block.kind == "reported" for block in table.blocks):
+        logger.warning("no score in %s is of table %s", shorten_list([*map(str, scores)]), name)
     rows = sum(len(block.rows) for block in table.blocks)
     logger.info("table %s: %d blocks, %d rows", name, len(table.blocks), rows)
 

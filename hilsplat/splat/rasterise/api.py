@@ -9,7 +9,7 @@ from scipy.sparse import csr_matrix
 
 from cpusplat import views
 from cpusplat.project import pack_camera
-from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.base.errors import HilsplatError, SettingsError, require_kind
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 
@@ -61,14 +61,12 @@ def render(
         threads: does not affect the result.
 
     Raises:
-        SettingsError: `camera` is not a camera, the background is not a colour, or there are not as many
-            features as Gaussians.
+        SettingsError: an argument has the wrong type, the background is not a colour, or there are not as
+            many features as Gaussians.
         HilsplatError: Gaussians have non-finite parameters.
     """
-    if not isinstance(camera, Camera):
-        raise SettingsError(
-            f"{camera!r} is not a camera", fix="pass scene.cameras[...], or use scene.render(view)"
-        )
+    require_kind(gaussians, Gaussians, "read them: hilsplat.load_gaussians(...)")
+    require_kind(camera, Camera, "pass scene.cameras[...], or use scene.render(view)")
     if np.shape(background) != (3,):
         raise SettingsError("the background is not a colour", expected="3 numbers", found=repr(background))
     if features is not None and len(features) != len(gaussians):

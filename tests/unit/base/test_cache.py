@@ -148,14 +148,6 @@ def test_commands_that_prune_at_once_do_not_disturb_each_other(tmp_path: Path) -
     assert left(tmp_path) == []
 
 
-def test_a_link_in_a_cache_is_deleted_without_its_target(cache, tmp_path_factory):
-    drawing = tmp_path_factory.mktemp("mine") / "drawing.npz"
-    drawing.touch()
-    (cache / f"masks/00/{5:064}.npz").symlink_to(drawing)
-    prune_cache(cache, ["masks"], days=0.0, max_mib=0.0)
-    assert drawing.exists()
-
-
 def test_cache_computes_once_and_recovers_from_a_damaged_entry(tmp_path: Path) -> None:
     cache = ViewCache(tmp_path)
     for hits in (0, 1):

@@ -1,6 +1,8 @@
 """Digests follow content; artifacts of different sources are refused."""
 
+import errno
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -68,3 +70,10 @@ def test_folders_that_link_to_each_other_are_read_once_each_way(tmp_path):
         (tmp_path / folder / other).symlink_to(tmp_path / other)
     found = [path.relative_to(tmp_path).as_posix() for path in visible_files(tmp_path)]
     assert found == ["a/all/of_all.png", "a/of_a.png", "all/a/of_a.png", "all/of_all.png"]
+
+
+def test_a_disk_error_while_a_file_is_digested_names_the_file(tmp_path, monkeypatch):
+    (tmp_path / "a.npz").write_bytes(b"1")
+    monkeypatch.setattr("hashlib.file_digest", Mock(side_effect=OSError(errno.EIO, "Input/output error")))
+    with pytest.raises(OSError, match=r"Input/output error: .*a\.npz"):
+        sha256_of_path(tmp_path)

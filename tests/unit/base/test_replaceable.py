@@ -70,9 +70,11 @@ def test_only_outputs_in_the_record_of_the_same_stage_may_be_replaced(photograph
         ownership.require_replaceable([out, photographs], "gaussians", [])
 
 
-def test_outputs_of_a_killed_writer_may_be_replaced(photographs):
+def test_outputs_of_a_killed_writer_may_be_replaced(photographs, tmp_path):
     lock_path(photographs).write_text("unfinished\n")
     ownership.require_replaceable([photographs], "masks", [])
+    lock_path(tmp_path / "table.csv").write_text("unfinished\n")
+    ownership.require_replaceable([tmp_path / "table.csv", photographs], "table", [])
 
 
 @pytest.mark.parametrize("broken", ["", "{", "[]", '{"stage": "masks"}', '{"stage": "masks", "outputs": 3}'])
@@ -93,6 +95,12 @@ def test_an_input_is_never_an_output(photographs, tmp_path):
     record(tmp_path, "poses")
     with pytest.raises(ArtifactError, match="contains the input"):
         ownership.require_replaceable([tmp_path], "poses", [photographs])
+
+
+@pytest.mark.parametrize("names", [("table.md", "table.md"), ("fit", "fit/gaussians.ply")])
+def test_outputs_of_a_stage_do_not_replace_each_other(tmp_path, names):
+    with pytest.raises(ArtifactError, match=f"table writes other outputs to .*{names[0]}, too"):
+        ownership.require_replaceable([tmp_path / name for name in names], "table", [])
 
 
 def test_the_working_and_the_home_folder_are_never_outputs(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from huggingface_hub import file_download
 from huggingface_hub.utils import reset_sessions
 
 from hilsplat.hub import retries
-from hilsplat.hub.pins import pins
+from hilsplat.hub.catalogue import pins
 from tests.loopback_hub import LoopbackHub, loopback_hub
 from tests.unit.export.conftest import clip_parts, transformers
 from tests.unit.finished_desk import write_colour_clip
@@ -52,7 +52,7 @@ def hub(repositories, monkeypatch, tmp_path) -> Iterator[LoopbackHub]:
     with loopback_hub() as served:
         served.repositories.update(repositories)
         point_at(served.endpoint, monkeypatch)
-        monkeypatch.setattr("hilsplat.hub.pins.TABLE", write_pins(tmp_path / "pins.tsv"))
+        monkeypatch.setattr("hilsplat.hub.catalogue.PINS", write_pins(tmp_path / "pins.tsv"))
         monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
         monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
         monkeypatch.setattr(huggingface_hub.constants, "DOWNLOAD_CHUNK_SIZE", 2**16)

@@ -2,12 +2,14 @@
 
 import errno
 import hashlib
+import io
 import json
 import re
 import shutil
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from email.utils import formatdate
 from pathlib import Path
 from unittest.mock import Mock
@@ -22,8 +24,8 @@ from hilsplat.base.lineage import sha256_of_file
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.model_check import check_models
 from hilsplat.hub import catalogue, get
+from hilsplat.hub.catalogue import pins
 from hilsplat.hub.get import get_models
-from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import retry_after_s
 from hilsplat.models.store import RELEASES, models_table, real_model
 from tests.loopback_hub import Refusal, git_sha1
@@ -102,7 +104,8 @@ def test_without_a_name_the_recommended_pair_is_fetched_and_used(hub, repositori
 
 
 def test_a_second_get_transfers_nothing_and_a_new_commit_replaces_all_but_files_of_the_user(hub, changed):
-    get_models(["sam-vit-base"])
+    get_models(["sam-vit-base", SAM])
+    assert len(hub.ranges(ENCODER)) == 1
     hub.asked.clear()
     assert "models/sam-vit-base already exists" in get_models(["sam-vit-base"])
     assert [path for _, path, _ in hub.asked] == [f"/api/models/{SAM}"]
@@ -142,6 +145,23 @@ def test_a_failed_download_is_resumed(hub, waits):
     (resumed,) = hub.ranges(ENCODER)
     assert 0 < int(resumed.removeprefix("bytes=").removesuffix("-")) <= 300_000
     assert visible() == ["sam-vit-base"] and not STAGING.exists()
+
+
+@pytest.mark.parametrize("name", ["CACHEDIR.TAG", "config.json.metadata"])
+def test_a_disk_error_while_fetching_costs_only_that_attempt(hub, monkeypatch, name):
+    opening = io.open
+
+    def failing(path, mode="r", *arguments, **options):
+        if Path(path).name == name and ("w" in mode) == (name == "CACHEDIR.TAG"):
+            raise OSError(errno.EIO, "Input/output error", str(path))
+        return opening(path, mode, *arguments, **options)
+
+    with monkeypatch.context() as patched, suppress(OSError):
+        patched.setattr("io.open", failing)
+        patched.setattr("builtins.open", failing)
+        get_models(["sam-vit-base"])
+    get_models(["sam-vit-base"])
+    assert visible() == ["sam-vit-base"]
 
 
 def test_files_with_another_digest_are_refused_and_deleted(hub, repositories):

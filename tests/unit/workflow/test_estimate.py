@@ -1,5 +1,6 @@
 """The table after a dry run, and the times that `hilsplat run` predicts for photographs."""
 
+import logging
 import re
 from types import SimpleNamespace
 
@@ -7,6 +8,7 @@ import pytest
 
 from hilsplat.workflow import estimate
 from hilsplat.workflow.resources import NODES, PICTURE_S, START_S, JobResources, Size
+from snakemake_logger_plugin_hilsplat import LogHandler
 from tests.unit.workflow.plans import BENCHMARK, plan_of
 from tests.unit.workflow.test_resources import plan
 
@@ -39,6 +41,24 @@ def test_jobs_are_summed_by_data_set(resources, monkeypatch):
     assert rows[1] == ["synthetic", "2", "4", "1.0 GB", "4.0 GB", "1.10", f"{gpu:.2f}"]
     assert [row[0] for row in rows[2:]] == ["tables", "all"]
     assert rows[3][1:5] == ["2", "5", "1.0 GB", "4.0 GB"]
+
+
+def test_a_dry_run_lists_each_job_with_its_reason_on_one_line(capsys):
+    settings = SimpleNamespace(stdout=True, dryrun=True, verbose=False, quiet=None)
+    handler = LogHandler(settings, None)
+    facts = {"rule_name": "masks", "wildcards": {**SCENES[0], "variant": "default"}, "resources": {}}
+    for event, message, more in (
+        (None, "Building DAG of jobs...", {}),
+        ("run_info", "Job stats:", {}),
+        ("job_info", "rule masks:\n    input: many", facts | {"reason": "Missing output files: results/a"}),
+    ):
+        common = {"msg": message, "levelno": logging.INFO, "pathname": "a.py", "event": event}
+        handler.handle(logging.makeLogRecord(common | more))
+    handler.close()
+    assert capsys.readouterr().out.splitlines() == [
+        "Job stats:",
+        "rule masks: synthetic/0/default: Missing output files",
+    ]
 
 
 DESK = "photos desk photos desk arbitrary"

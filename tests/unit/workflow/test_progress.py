@@ -196,6 +196,18 @@ def test_errors_of_failed_jobs_are_the_last_lines_with_their_fix_and_a_retry_cou
     assert screen.text.removeprefix(before) == f"photos/desk gaussians failed; its log is {first}\n{error}\n"
 
 
+def test_a_job_that_is_repeated_while_others_of_its_rule_wait_has_not_failed(screen, run):
+    screen.tell("run_info", stats={"masks": 2})
+    screen.start(1, "masks")
+    screen.tell("job_error", "Error in rule", logging.ERROR, jobid=1)
+    for number in (1, 2):
+        screen.start(number, "masks")
+        screen.end(number)
+    assert run.counts() == "2 of 2 done"
+    screen.display.close()
+    assert screen.text.count("failed") == 1, "at the time, but not at the end"
+
+
 @pytest.mark.parametrize("how", ["died with <Signals.SIGKILL: 9>", "returned non-zero exit status 137"])
 def test_a_killed_job_is_explained_at_the_end(screen, tmp_path, how):
     log_lines(log := tmp_path / "gaussians.log", (20, "a", "step 5"))

@@ -79,6 +79,27 @@ def test_other_options_are_found(results):
         assert problems() == ({"scene": f"it was made with another --{other}"} if other else {})
 
 
+def test_tables_of_other_variants_or_names_are_found(results):
+    table, scores = Path("results/tables/hierarchy.csv"), FOLDER / "scores.csv"
+    for path in (table, scores):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("")
+    stage, labels = stage_of("table"), '{"default": "ours"}'
+    command = ["hilsplat", "table", "hierarchy", "--labels", labels, str(scores), "--out", str(table)]
+    record = {"stage": "table", "code": stage.code_digest(), "settings": {}, "seed": None}
+    write_provenance(table, command=command, inputs=Inputs("table", {"scores": [scores]}), **record)
+
+    def problem(**config: object) -> str:
+        plan = plan_of(Path(), BENCHMARK[:1], **config)
+        return Records(plan.results, plan, every_byte=False).state(table)[1]
+
+    assert problem(labels={"default": "ours"}) == ""
+    assert problem() == "it was made with another --labels"
+    for variants in (["default", "low"], ["low"]):
+        config = {"main_variants": variants, "variants": {"low": {"masks": {"theta": 0.6}}}}
+        assert problem(**config) == "it was made from other scores"
+
+
 def test_missing_and_cut_files_are_found(results):
     (MASKS / "b.npz").write_text("longer")
     (TREE / "a.npz").unlink()

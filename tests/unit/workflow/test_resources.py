@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -14,6 +15,7 @@ from hilsplat.scene.layouts import vertex_count
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.resources import COSTS, RUNNER_MB, JobResources, Size
 from tests.conftest import PROJECT
+from tests.unit.artifact_changes import flip_bit
 from tests.unit.workflow.plans import Job, plan_of
 
 RECORDS = [
@@ -128,6 +130,21 @@ def test_jobs_that_use_a_card_request_one(
     config["masks"]["segmenter"] = segmenter
     found = JobResources(plan(tmp_path, **config), cores)
     assert [found.gpus(section)(JOB) for section in sections] == expected
+
+
+def test_the_size_of_a_scene_is_that_of_its_settings_until_its_cameras_can_be_read(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found, cameras = plan(tmp_path), Path("results/synthetic/0/scene/cameras.npz")
+    (row,) = found.rows
+    planned = JobResources(found).size(row)
+    cameras.parent.mkdir(parents=True)
+    np.savez(cameras, size_hw=np.array([(500, 1000)] * 2, np.int32))
+    assert JobResources(found).size(row) == (2, 0.5)
+    flip_bit(cameras, 0.5)
+    assert JobResources(found).size(row) == planned
+    for damaged in (b"", b"PK"):
+        cameras.write_bytes(damaged)
+        assert JobResources(found).size(row) == planned
 
 
 def test_the_number_of_gaussians_is_read_from_the_header_of_a_ply(tmp_path):

@@ -100,6 +100,8 @@ def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
     assert 'only=["synthetic/two"]' in started[-1]
     runs.run(["./results/synthetic/two/", "./results/synthetic/two/scene/"], [], [])  # as shells complete
     assert 'only=["synthetic/two"]' in started[-1] and started[-1][-1] == "results/synthetic/two/scene"
+    runs.run(["out/synthetic/two/"], [], ["--config", "results=./out/"])
+    assert 'only=["synthetic/two"]' in started[-1]
     runs.run(["synthetic/*", "tables"], [], [])
     assert 'only=["synthetic/*"]' in started[-1] and started[-1][-2:] == ["--", "tables"]
     runs.run(["models/the-two"], [], [])  # a file, although it ends like the name of a scene
@@ -158,7 +160,9 @@ def test_the_locks_of_a_dead_run_are_removed_once(folder, started, unlocked):
     leave_marker()
     runs.run([], [], [])
     assert unlocked == ["unlock"]
-    assert list(runs.STATE.glob("run-*")) == []
+    (runs.STATE / "run-00000002").touch()  # a full disk
+    runs.run([], [], [])
+    assert unlocked == ["unlock"] * 2 and list(runs.STATE.glob("run-*")) == []
 
 
 def leave_marker(host: str = "") -> None:
@@ -246,6 +250,10 @@ def test_a_setting_that_overrides_replace_in_all_scenes_is_refused_or_reported(f
     runs.run([], [], ["-n", "--config", "masks.theta=0.7", "masks.min_area_px=5"])
     runs.run([], [], ["-n", "--config", "overrides.benchmark.masks.theta=0.8"])
     assert len(started) == 2 and not caplog.text
+    variant = ["variants={low: {masks: {theta: 0.6}}}", "main_variants=[low]"]
+    runs.run([], [], ["-n", "--config", *variant, "masks={theta: 0.7, min_area_px: 5}"])
+    (message,) = caplog.messages
+    assert message == "--config: masks.theta has no effect on variants that set it: low"
     methods = ["method={name: langsplat, steps: 50}", "overrides={benchmark: {method: {name: lifted}}}"]
     with pytest.raises(SettingsError, match=r"method\.name has no effect"):
         runs.run([], [], ["-n", "--config", *methods])

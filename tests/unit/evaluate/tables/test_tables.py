@@ -250,6 +250,13 @@ def test_scenes_whose_names_differ_only_in_a_space_have_columns_of_their_own(tmp
     assert cells(row, "desk1 mIoU", "desk_1 mIoU") == ["50.00", "70.00"]
 
 
+def test_scores_that_belong_to_no_row_of_a_table_are_reported(tmp_path, caplog):
+    built(tmp_path, "lerf", [score("iou", 0.7, **LERF)])
+    assert "of table lerf" not in caplog.text
+    built(tmp_path, "waymo", [score("iou", 0.7, **LERF)])
+    assert "scores.csv is of table waymo" in caplog.text
+
+
 def test_an_unknown_table_is_an_error_that_lists_the_tables(tmp_path):
     with pytest.raises(ArtifactError, match="one of lerf, 3dovs, replica"):
         run_table("leftovers", [], PUBLISHED / "lerf.csv", {}, tmp_path / "x.csv")
