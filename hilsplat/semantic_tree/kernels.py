@@ -22,10 +22,11 @@ def add_views(mass, pair_view, pair_row, order, matrix, out):
     current = -1
     for pair in order:
         if pair_view[pair] != current:
+            if current >= 0:  # a view sees few of all Gaussians
+                unpacked[mass_indices[mass_indptr[current] : mass_indptr[current + 1]]] = 0.0
             current = pair_view[pair]
-            unpacked[:] = 0.0
-            for k in range(mass_indptr[current], mass_indptr[current + 1]):
-                unpacked[mass_indices[k]] = mass_data[k]
+            begin, end = mass_indptr[current], mass_indptr[current + 1]
+            unpacked[mass_indices[begin:end]] = mass_data[begin:end]
         row = pair_row[pair]
         for k in range(indptr[row], indptr[row + 1]):
             out[k] += unpacked[indices[k]]
