@@ -35,6 +35,15 @@ def label_file(folder, objects, size_wh=(20, 10), name="frame_00001"):
     return path
 
 
+@pytest.mark.parametrize(("layer", "num_px"), [(2.0, 16 - 4), (1.0, 16), (None, 16)])
+def test_the_background_of_isat_is_a_hole_in_lower_layers_and_no_object(layer, num_px, tmp_path):
+    hole = thing("__background__", [[3, 4], [4, 4], [4, 5], [3, 5]], layer=layer)
+    labels = read_isat(label_file(tmp_path, [thing(layer=1.0), hole]))
+    (knife,) = labels.objects
+    assert fill_polygons(knife.polygons, labels.size_hw).sum() == num_px
+    assert knife.box_xyxy.tolist() == [2, 3, 5, 6]
+
+
 @pytest.fixture
 def lerf(tmp_path, true_world):
     """The small world as LERF-OVS's scene `figurines`, its second and fourth view labelled."""
