@@ -29,7 +29,7 @@ UNUSED = (*TRAINED, *MAPS)
 PHOTO_FOLDERS = ("images", "input")
 """Folders of photographs: COLMAP's and nerfstudio's, then that of 3DGS's `convert.py`."""
 
-SCALED = re.compile(r"(?<=/images)_([248])(?=/)")
+SCALED = re.compile(r"(?:(?<=/images)|(?<=^images))_([248])(?=/)")
 """What nerfstudio and Mip-NeRF 360 add to the name of a folder of smaller copies."""
 
 MIN_PHOTOS = 3  # minimum number of photographs for structure from motion

@@ -34,10 +34,7 @@ Bits = Annotated[str, Field(max_length=(MAX_GAUSSIANS // 8 // 3 + 1) * 4)]
 MAX_BODY_BYTES = 4 << 20
 """Maximum size of a request: the table of a style, and the marks of two sets of Gaussians."""
 
-
-Side = Annotated[
-    int, Field(ge=1, le=2 * MAX_SIDE_PX)
-]  # of a view of the page, which may be wider than 4096 px
+Side = Annotated[int, Field(ge=1, le=2 * MAX_SIDE_PX)]  # of a page's view, which may exceed a picture's limit
 
 
 class WireCamera(Message):

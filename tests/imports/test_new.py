@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -228,10 +229,12 @@ def test_a_dry_run_of_an_archive_leaves_nothing(kind, tmp_path):
         ("scan/color", "scan/label-filt", "scan/masks_2"),
     ],
 )
-def test_photographs_are_found_where_people_have_them(folders, tmp_path):
+def test_photographs_are_found_where_people_have_them(folders, tmp_path, monkeypatch):
     for folder in folders:
         photographs(tmp_path / folder)
     assert photo_folder(tmp_path) == tmp_path / folders[0]
+    monkeypatch.chdir(tmp_path)
+    assert photo_folder(Path()) == Path(folders[0])
 
 
 def test_with_known_poses_the_images_that_have_one_are_reported(tmp_path):

@@ -195,7 +195,6 @@ export class Renderer {
 
   get settled() { return !this.sorted.pending && this.sorted.row && this.sorted.wanted.every((v, k) => v === this.sorted.row[k]); }
 
-
   // panes: [{variant, style}], side by side with one camera. width and height: of the whole canvas, px.
   draw(camera, panes, width, height) {
     const gl = this.gl;
