@@ -246,7 +246,7 @@ def _recorded(stage: Stage[..., Any], arguments: Mapping[str, Any]) -> Iterator[
     device = next(
         (section.rasteriser for section in sections.values() if hasattr(section, "rasteriser")), None
     )
-    with output_lock(out):
+    with output_lock(out, *beside, *new):
         if any(section.uses_card for section in sections.values()):
             take_card()
         before, code = Inputs(stage.name, inputs), stage.code_digest(extra.plugins)

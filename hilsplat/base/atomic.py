@@ -1,12 +1,13 @@
 """Atomic writing, locks of outputs, and errors on a full disk."""
 
 import errno
+import json
 import logging
 import os
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hilsplat.base.errors import MACHINE, ArtifactError, DiskSpaceError, HilsplatError
@@ -173,11 +174,11 @@ def require_free_space(folder: Path, needed_mib: float) -> None:
 
 
 @contextmanager
-def output_lock(output: Path) -> Iterator[None]:
+def output_lock(output: Path, *beside: Path) -> Iterator[None]:
     """Lock an output for writing; raise ArtifactError if another process is writing it.
 
     If a writer fails or is killed, its lock file stays non-empty, because the output may then match
-    neither the provenance record nor the inputs of that writer.
+    neither the provenance record nor the inputs of that writer. It names the files that are written `beside`.
     """
     output = Path(output)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -189,7 +190,7 @@ def output_lock(output: Path) -> Iterator[None]:
                 f"another process is writing {output}", fix="let it finish or stop it, then run again"
             ) from error
         stream.truncate(0)
-        stream.write("unfinished\n")
+        json.dump([os.path.relpath(path, output.parent) for path in beside], stream)
         stream.flush()
         yield
         stream.truncate(0)
@@ -224,3 +225,14 @@ def was_interrupted(output: Path) -> bool:
         return lock_path(output).stat().st_size > 0
     except OSError:
         return False
+
+
+def interrupted_outputs(output: Path) -> set[Path]:
+    """Return the output and the files beside it if their last writer was killed or failed, else nothing."""
+    if not was_interrupted(output):
+        return set()
+    outputs = {output.resolve()}
+    with suppress(OSError, TypeError, ValueError):  # the disk was full, or somebody else wrote the file
+        names = json.loads(lock_path(output).read_text(encoding="utf-8"))
+        outputs |= {(output.parent / name).resolve() for name in names}
+    return outputs

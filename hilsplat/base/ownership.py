@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from hilsplat.base.artifacts import is_artifact, read_memo, write_json
-from hilsplat.base.atomic import atomic_folder, changing, was_interrupted
+from hilsplat.base.atomic import atomic_folder, changing, interrupted_outputs, was_interrupted
 from hilsplat.base.errors import ArtifactError, ImageError
 from hilsplat.base.files import FILES_OF_DESKTOPS
 from hilsplat.base.images import opened_image
@@ -26,13 +26,13 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
     """Check that a stage can write its outputs without overwriting unrelated data.
 
     An existing file or folder may be replaced if it is empty, if the same stage wrote it according to the
-    provenance of the first output, or if a process failed or was killed while writing the outputs.
+    provenance of the first output, or if a process failed or was killed while writing it.
 
     Raises:
         ArtifactError: an output is in an artifact, is or contains another output, an input, or the working,
             home or root folder, or exists and is not an earlier output of the stage.
     """
-    recorded, is_unfinished = _recorded_outputs(outputs[0], stage), was_interrupted(outputs[0])
+    replaceable = {*_recorded_outputs(outputs[0], stage), *interrupted_outputs(outputs[0])}
     sources, paths = [Path(path).resolve() for path in inputs], [out.resolve() for out in outputs]
     for out, path in zip(outputs, paths, strict=True):
         require_outside_artifacts(out)
@@ -47,7 +47,7 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
                 raise ArtifactError(
                     f"output {out} is or contains the {name} folder", fix="choose a new file or folder"
                 )
-        if _is_something(out) and path not in recorded and not is_unfinished:
+        if _is_something(out) and path not in replaceable and not was_interrupted(out):
             raise _foreign(out, stage, f"a new path, or an earlier output of {stage} with its provenance")
 
 

@@ -1,5 +1,6 @@
 """A command replaces its own earlier outputs and nothing else."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from hilsplat.base import ownership
 from hilsplat.base.artifacts import provenance_path, write_index
-from hilsplat.base.atomic import lock_path
+from hilsplat.base.atomic import lock_path, output_lock
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.images import write_png
 from hilsplat.cli.common import require_new_folder
@@ -70,11 +71,24 @@ def test_only_outputs_in_the_record_of_the_same_stage_may_be_replaced(photograph
         ownership.require_replaceable([out, photographs], "gaussians", [])
 
 
-def test_outputs_of_a_killed_writer_may_be_replaced(photographs, tmp_path):
+def test_outputs_of_a_killed_writer_may_be_replaced(photographs):
     lock_path(photographs).write_text("unfinished\n")
     ownership.require_replaceable([photographs], "masks", [])
-    lock_path(tmp_path / "table.csv").write_text("unfinished\n")
-    ownership.require_replaceable([tmp_path / "table.csv", photographs], "table", [])
+
+
+@pytest.mark.parametrize("cut", [0, 5])
+def test_of_the_files_beside_an_output_only_those_of_its_killed_writer_may_be_replaced(tmp_path, cut):
+    out, beside, other = (tmp_path / name for name in ("table.csv", "more/table.md", "notes.md"))
+    with pytest.raises(KeyboardInterrupt), output_lock(out, beside):
+        for path in (out, beside, other):
+            path.parent.mkdir(exist_ok=True)
+            path.write_text("text")
+        raise KeyboardInterrupt
+    lock_path(out).write_text(lock_path(out).read_text()[cut:])  # the disk may have been full
+    ownership.require_replaceable([out], "table", [])
+    for path, is_replaceable in ((beside, not cut), (other, False)):
+        with nullcontext() if is_replaceable else pytest.raises(ArtifactError, match="did not write it"):
+            ownership.require_replaceable([out, path], "table", [])
 
 
 @pytest.mark.parametrize("broken", ["", "{", "[]", '{"stage": "masks"}', '{"stage": "masks", "outputs": 3}'])
