@@ -178,7 +178,7 @@ def output_lock(output: Path, *beside: Path) -> Iterator[None]:
     """Lock an output for writing; raise ArtifactError if another process is writing it.
 
     If a writer fails or is killed, its lock file stays non-empty, because the output may then match
-    neither the provenance record nor the inputs of that writer. It names the files that are written `beside`.
+    neither the provenance record nor the inputs of that writer. It lists the files `beside` the output.
     """
     output = Path(output)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -232,7 +232,7 @@ def interrupted_outputs(output: Path) -> set[Path]:
     if not was_interrupted(output):
         return set()
     outputs = {output.resolve()}
-    with suppress(OSError, TypeError, ValueError):  # the disk was full, or somebody else wrote the file
+    with suppress(OSError, TypeError, ValueError):  # it was cut by a full disk, or is not ours
         names = json.loads(lock_path(output).read_text(encoding="utf-8"))
         outputs |= {(output.parent / name).resolve() for name in names}
     return outputs
