@@ -221,12 +221,15 @@ class LanguageScene(NodeQueries):
 
     def hits_of(self, nodes: NodeHits, limit: int) -> list[Hit]:
         """Return up to `limit` of the best nodes as answers."""
-        doubts, limit = doubts_of(nodes), checked_count(limit)
-        scores = relevancy_of_margins(nodes.values[:limit], self.settings.relevancy_scale).tolist()
+        doubts, first = doubts_of(nodes), slice(checked_count(limit))
         return [
             self._hit(node, score, nodes.route, doubts)
-            for node, score in zip(nodes.ids[:limit].tolist(), scores, strict=True)
+            for node, score in zip(nodes.ids[first].tolist(), self.scores_of(nodes)[first], strict=True)
         ]
+
+    def scores_of(self, nodes: NodeHits) -> list[float]:
+        """Return the relevancies of selected nodes."""
+        return relevancy_of_margins(nodes.values, self.settings.relevancy_scale).tolist()
 
     def _hit(self, node: int, score: float, route: str, doubts: tuple[Doubt, ...]) -> Hit:
         return Hit(**vars(self._node(node)), score=score, route=route, doubts=doubts)

@@ -123,24 +123,24 @@ def box_corners(rows: Float32[np.ndarray, "n 5 3"]) -> list[list[list[float]]]:
 
 
 class FoundNode(TypedDict):
-    """One answer; `node` is a row of the semantic tree, and views are numbered in camera order."""
+    """One answer; `node` is a row of the semantic tree."""
 
     node: int
     level: str
     score: float
-    name: str
-    best_views: list[int]
 
 
 class Answer(TypedDict):
     """Answers to a text, or nodes that look like a node or a picture.
 
-    `relevancy` has one value per node, `hits` are all answers, best first; `route` is as in `Hit`.
+    `relevancy` has one value per node, `hits` are all answers, best first; `best_views` show the first one and
+    are numbered in camera order; `route` is as in `Hit`.
     """
 
     text: str
     level: str
     hits: list[FoundNode]
+    best_views: list[int]
     relevancy: list[float]
     doubts: list[str]
     caution: str
@@ -158,8 +158,9 @@ def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Ans
         asked.text, level=asked.level, answerer=answerer, view=view, threshold=asked.threshold
     )
     relevancy = scene.node_relevancy(path_of(asked.text)[-1:], answerer)[0]
+    found = nodes.ids.tolist(), scene.scores_of(nodes), scene.hits_of(nodes, 1)
     return {
-        **_answer(scene, asked.text, scene.hits_of(nodes, len(nodes.ids)), relevancy),
+        **_answer(scene, asked.text, *found, relevancy),
         "level": nodes.level.label,
         "doubts": [str(doubt) for doubt in doubts_of(nodes)],
         "caution": scene.caution_about(asked.text),
@@ -170,25 +171,28 @@ def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Ans
 def alike(scene: LanguageScene, hits: Sequence[Hit], what: str, also: Sequence[int] = ()) -> Answer:
     """Return nodes that look like a node or picture, as an answer; nodes in `also` get relevancy 1."""
     relevancy = np.zeros(len(scene.tree))
-    relevancy[[hit.node for hit in hits]] = [max(hit.score, 0.0) for hit in hits]
+    nodes, scores = [hit.node for hit in hits], [hit.score for hit in hits]
+    relevancy[nodes] = np.maximum(scores, 0.0)
     relevancy[list(also)] = 1
-    return _answer(scene, what, hits, relevancy)
+    return _answer(scene, what, nodes, scores, hits, relevancy)
 
 
-def _answer(scene: LanguageScene, text: str, hits: Sequence[Hit], relevancy: np.ndarray) -> Answer:
+def _answer(
+    scene: LanguageScene,
+    text: str,
+    nodes: Sequence[int],
+    scores: Sequence[float],
+    first: Sequence[Hit],
+    relevancy: np.ndarray,
+) -> Answer:
+    """Return an answer; `first` has at least the first hit, since all of tens of thousands take seconds."""
+    labels = [LEVELS[level - 1].label for level in scene.tree.level[list(nodes)]]
+    found = zip(nodes, labels, scores, strict=True)
     return {
         "text": text,
-        "level": hits[0].level.label if hits else "",
-        "hits": [
-            {
-                "node": hit.node,
-                "level": hit.level.label,
-                "score": round(hit.score, 4),
-                "name": hit.name,
-                "best_views": [scene.views.names.index(view) for view in hit.best_views],
-            }
-            for hit in hits
-        ],
+        "level": labels[0] if labels else "",
+        "hits": [{"node": node, "level": level, "score": round(score, 4)} for node, level, score in found],
+        "best_views": [scene.views.names.index(view) for hit in first[:1] for view in hit.best_views],
         "relevancy": np.round(relevancy, 4).tolist(),
         "doubts": [],
         "caution": "",

@@ -43,7 +43,7 @@ function refused(error) {
 }
 
 function answered(what, answer) {
-  page.asked = { ...what, shows: answer.hits[0]?.best_views ?? [] };
+  page.asked = { ...what, shows: answer.best_views };
   tell(`${what.alike ? `Like ${what.alike}: ` : ""}${summary(answer)}`);
   listAnswers();
   page.outline.answered(answer.hits.map((hit) => hit.node));
