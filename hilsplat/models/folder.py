@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from hilsplat.base.artifacts import read_json
-from hilsplat.base.errors import ArtifactError, ModelError
+from hilsplat.base.errors import ArtifactError, ModelError, in_one_line
 from hilsplat.base.lineage import sha256_of_file, sha256_of_json
 from hilsplat.models import layouts
 from hilsplat.models.card import CPU
@@ -142,11 +142,13 @@ def _read_config(folder: Path, kind: str | None, fix: str) -> tuple[str, dict[st
     try:
         config = read_json(folder / "config.json")
     except ArtifactError as error:
+        names = sorted(path.name for path in folder.iterdir())
+        is_damaged = "config.json" in names
         raise ModelError(
             f"model folder {folder} has no readable config.json",
             expected=f"config.json of {supported}",
-            found=", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder",
-            fix=fix,
+            found=in_one_line(error) if is_damaged else ", ".join(names[:12]) or "an empty folder",
+            fix=WHOLE_COPY if is_damaged else fix,
         ) from error
     name, config = layouts.layout_of(config), config if isinstance(config, dict) else {}
     model_type = config.get("model_type", name)

@@ -119,7 +119,7 @@ class NodeQueries(ABC):
         while int(self.tree.parent[parent]) != NONE:
             parent = int(self.tree.parent[parent])
         whole = self.name_of(parent)
-        return name if not whole or whole in name else f"{name} of {whole}"
+        return name if not whole or f" {whole} " in f" {name} " else f"{name} of {whole}"
 
     def own_name_of(self, node: int) -> str:
         """Return `name_of` without the name of the whole that a part belongs to."""

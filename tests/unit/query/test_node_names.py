@@ -78,6 +78,9 @@ def test_names_of_parts_include_their_whole_and_user_given_names_come_first(desk
     order = [scene.query(text)[0].node for text in ("mug", "book", "mug > handle", "mug > handle > rim")]
     assert order[:2] == [0, 1] and scene.name_of(order[2]) == "handle of mug"
     assert scene.name_of(order[3]) == "rim of mug"
+    named_alike = NodeNaming(("cup", "book", "cupboard", "", "rim of cup"), (False,) * 5, scene.naming.rivals)
+    alike = replace(scene, naming=named_alike)
+    assert alike.name_of(order[2]) == "cupboard of cup" and alike.name_of(order[3]) == "rim of cup"
     tree = desk / "default/semantic_tree"
     write_names(desk, tree, {0: "pot"}, len(scene.tree), "none")
     renamed = replace(scene, names=hilsplat.open_scene(desk).names)

@@ -45,7 +45,7 @@ def as_torch(folder: Path) -> None:
         (written(ENCODER, b"half"), r"encoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
         (written(ENCODER, LFS_POINTER), r"Git LFS pointer(.|\n)*git lfs pull"),
         (written(DECODER, b"half"), r"decoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
-        (written(CONFIG, b"{"), r"no readable config.json(.|\n)*model_type"),
+        (written(CONFIG, b"{"), r"no readable config.json(.|\n)*not valid JSON(.|\n)*fetch a complete copy"),
         (written(CONFIG, []), r"a different kind of model(.|\n)*model_type"),
         (written(CONFIG, {"model_type": "sam3"}), r"SAM 2 or 2.1 \(sam2\)(.|\n)*sam3(.|\n)*use SAM 2.1"),
         (written(CONFIG, {"model_type": "blip"}), r"SAM 2 or 2.1 \(sam2\)(.|\n)*blip(.|\n)*docs/models.md"),
