@@ -5,6 +5,7 @@ import io
 import logging
 import math
 import re
+import threading
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -35,6 +36,8 @@ HDR = re.compile(rb"colrnclx..\0[\x10\x12]|cICP.[\x10\x12]", re.DOTALL)
 
 MAX_PX = 2 * (Image.MAX_IMAGE_PIXELS or 0)  # Pillow refuses more in a file's first picture
 
+MAX_READERS = 4  # maximum number of threads that read photographs, each with the pixels of one
+
 MIN_SIDE_PX, MAX_ASPECT = 16, 20  # limits on photographs; all stages were run on 16 x 16 and 320 x 16 px
 
 SLIVER = 0.01
@@ -44,6 +47,15 @@ MAX_CLASSES = 20  # maximum number of values in a map of classes; compressed or 
 
 GREY_NOISE = 16
 """Difference between the channels up to which a mask's pixel counts as grey, as after lossy compression."""
+
+_FILTERS = threading.RLock()  # warning filters are those of all threads
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Ignore what Pillow warns about, such as large images and odd EXIF tags."""
+    with _FILTERS, warnings.catch_warnings(action="ignore"):
+        yield
 
 
 def open_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> Image.Image:
@@ -64,7 +76,7 @@ def open_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> Image.Image
     else:
         formats = tuple(name for name in FORMATS if name != "HEIF")
     try:
-        with warnings.catch_warnings(action="ignore"):  # about large images and odd EXIF tags
+        with _without_warnings():
             image = Image.open(file, formats=formats)
             if image.format == "TIFF":
                 image.filename = ""  # else Pillow 13 maps the file into memory, and scrambles turned pictures
@@ -109,7 +121,7 @@ def image_size_hw(path: Path, *, upright: bool = False) -> tuple[int, int]:
 def exif_tags(image: Image.Image, ifd: ExifTags.IFD | None = None) -> Mapping[int, Any]:
     """Return an image's EXIF tags, those of its main directory or of `ifd`; skip damaged ones."""
     values = {}
-    with warnings.catch_warnings(action="ignore"), suppress(Exception):  # Pillow raises anything
+    with _without_warnings(), suppress(Exception):  # Pillow raises anything
         exif = image.getexif()
         tags: Mapping[int, Any] = exif if ifd is None else exif.get_ifd(ifd)
         for tag in tags:

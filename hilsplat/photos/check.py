@@ -18,8 +18,16 @@ from jaxtyping import Float32, Float64, UInt8
 
 from hilsplat.base.errors import ImageError, first_line, shorten_list
 from hilsplat.base.files import list_files, list_images
-from hilsplat.base.images import opened_image, orientation, read_image, require_usable_size, resize_to_fit
+from hilsplat.base.images import (
+    MAX_READERS,
+    opened_image,
+    orientation,
+    read_image,
+    require_usable_size,
+    resize_to_fit,
+)
 from hilsplat.base.lineage import sha256_of_file
+from hilsplat.base.processes import in_order
 from hilsplat.base.progress import track
 from hilsplat.scene.features import exif_focal_px
 from hilsplat.scene.layouts import photo_folder
@@ -150,22 +158,32 @@ def inspect_photos(folder: Path, posed: Sequence[Path] = ()) -> PhotoReport:
     num_rotated = 0
     checked: list[CheckedPhoto] = []
     matched, have_poses = matched_rows(len(photos)), bool(posed)
-    for row, path in enumerate(track(photos, "photographs checked")):
+
+    def inspected(row: int) -> tuple[CheckedPhoto, bool, str] | str:
+        """Return a photograph, whether it is turned, and its digest, or why it cannot be read."""
+        path = photos[row]
         name = path.relative_to(folder).as_posix()
         try:
             pixels = read_image(path)
             require_usable_size(path, pixels.shape[:2])
         except ImageError as error:
             reason = first_line(error.__cause__ or error).replace(str(path), name)
-            size = f" ({path.stat().st_size} bytes)" if path.exists() else ""
-            unreadable.append((name, reason + size))
-            continue
-        size_hw = (pixels.shape[0], pixels.shape[1])
+            return reason + (f" ({path.stat().st_size} bytes)" if path.exists() else "")
+        focal_px = exif_focal_px(path, (pixels.shape[0], pixels.shape[1]))
         with opened_image(path) as image:
-            num_rotated += orientation(image) > 1
+            is_turned = orientation(image) > 1
         is_matched = row in matched and not have_poses
-        checked.append(checked_photo(name, pixels, exif_focal_px(path, size_hw), is_matched=is_matched))
-        by_digest[sha256_of_file(path)].append(name)
+        return checked_photo(name, pixels, focal_px, is_matched=is_matched), is_turned, sha256_of_file(path)
+
+    reads = in_order(inspected, range(len(photos)), min(MAX_READERS, os.cpu_count() or 1))
+    for path, found in zip(photos, track(reads, "photographs checked", len(photos)), strict=True):
+        if isinstance(found, str):
+            unreadable.append((path.relative_to(folder).as_posix(), found))
+            continue
+        photo, is_turned, digest = found
+        num_rotated += is_turned
+        checked.append(photo)
+        by_digest[digest].append(photo.name)
     copies = {name for names in by_digest.values() for name in names[1:]}
     distinct = [photo for photo in checked if photo.name not in copies]
     return PhotoReport(

@@ -11,6 +11,7 @@ from PIL import ExifTags
 
 from hilsplat.base.errors import ImageError
 from hilsplat.base.images import (
+    MAX_READERS,
     exif_tags,
     open_image,
     read_image,
@@ -18,6 +19,7 @@ from hilsplat.base.images import (
     resize_to_fit,
     write_png,
 )
+from hilsplat.base.processes import in_order
 from hilsplat.base.progress import track
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.matching import match_pairs, read_features
@@ -101,7 +103,7 @@ def exif_time(path: Path) -> str:
 
 
 def prepare_images(
-    sources: Sequence[Path], folder: Path, max_side_px: int, min_share: float = 1.0
+    sources: Sequence[Path], folder: Path, max_side_px: int, min_share: float = 1.0, threads: int = 1
 ) -> tuple[list[WorkImage], dict[Path, str]]:
     """Write each photograph to `folder` as an upright PNG with a longer side of at most `max_side_px`.
 
@@ -109,19 +111,23 @@ def prepare_images(
     `min_share` can be used.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    images = []
-    damaged: dict[Path, str] = {}
-    for source, view in track(list(zip(sources, view_names(sources), strict=True)), "photographs read"):
+
+    def prepared(source: Path) -> WorkImage | str:
         try:
             pixels = read_image(source)
             require_usable_size(source, pixels.shape[:2], max_side_px)
         except ImageError as error:
-            damaged[source] = str(error)
-            continue
+            return str(error)
         pixels = resize_to_fit(pixels, max_side_px)
         size_hw = (pixels.shape[0], pixels.shape[1])
-        write_png(folder / view, pixels, WORK_COMPRESSION)
-        images.append(WorkImage(view, source, size_hw, exif_focal_px(source, size_hw), exif_time(source)))
+        write_png(folder / views[source], pixels, WORK_COMPRESSION)
+        return WorkImage(views[source], source, size_hw, exif_focal_px(source, size_hw), exif_time(source))
+
+    views = dict(zip(sources, view_names(sources), strict=True))
+    reads = track(in_order(prepared, sources, min(threads, MAX_READERS)), "photographs read", len(sources))
+    found = dict(zip(sources, reads, strict=True))
+    images = [image for image in found.values() if isinstance(image, WorkImage)]
+    damaged = {source: reason for source, reason in found.items() if isinstance(reason, str)}
     if len(images) < min_share * len(sources):
         raise ImageError(
             f"{len(damaged)} of {len(sources)} images in {sources[0].parent} cannot be used",

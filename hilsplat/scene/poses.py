@@ -140,7 +140,7 @@ def _reconstruct(
     if camera_model == "auto":
         camera_model = "simple_pinhole" if is_render else "simple_radial"
     work_images, unreadable = prepare_images(
-        sources, work / "images", settings.max_side_px, settings.min_registered_share
+        sources, work / "images", settings.max_side_px, settings.min_registered_share, threads
     )
     database, lenses = work / "features.db", lenses_of(work_images, camera_model, settings.single_camera)
     logger.info("%s: extracting and matching the features of %d images", name, len(work_images))

@@ -133,8 +133,8 @@ class FoundNode(TypedDict):
 class Answer(TypedDict):
     """Answers to a text, or nodes that look like a node or a picture.
 
-    `relevancy` has one value per node, `hits` are all answers, best first; `best_views` show the first one and
-    are numbered in camera order; `route` is as in `Hit`.
+    `relevancy` has one value per node, `hits` are all answers, best first; `best_views` show the first one,
+    numbered in camera order; `route` is as in `Hit`.
     """
 
     text: str

@@ -11,6 +11,7 @@ from jaxtyping import Float32, Float64, UInt8
 from hilsplat.base.errors import ImageError, shorten_list
 from hilsplat.base.files import is_outside
 from hilsplat.base.images import (
+    MAX_READERS,
     image_size_hw,
     opened_image,
     orientation,
@@ -19,7 +20,7 @@ from hilsplat.base.images import (
     resize_to_fit,
     write_png,
 )
-from hilsplat.base.processes import in_own_process
+from hilsplat.base.processes import in_order, in_own_process
 from hilsplat.base.progress import track
 from hilsplat.scene.assemble import Posed, PosedView, few_points_doubt, photo_of, split_views, undistort
 from hilsplat.scene.cameras import Photo
@@ -52,14 +53,23 @@ def import_poses(
     total = len(source.views) + len(source.left_out)
     with_image = {view.image: view for view in source.views if view.image is not None}
     posed: list[tuple[KnownView, PosedView]] = []
-    turned: list[str] = []
-    pairs = [*zip(with_image.values(), view_names([*with_image]), strict=True)]
-    for view, view_name in track(pairs, "images read"):
+    turned: list[str] = []  # images used as stored against their EXIF orientation
+
+    def imported(pair: tuple[KnownView, str]) -> tuple[PosedView, bool] | ImageError:
         try:
-            distorted = _with_pixels(view, view_name, work / "images", settings.max_side_px, turned)
-            posed.append((view, undistort(distorted, work / "pinhole", settings.max_side_px)))
+            distorted, as_stored = _with_pixels(*pair, work / "images", settings.max_side_px)
+            return undistort(distorted, work / "pinhole", settings.max_side_px), as_stored
         except ImageError as error:
-            source.drop(view, error)
+            return error
+
+    pairs = [*zip(with_image.values(), view_names([*with_image]), strict=True)]
+    reads = track(in_order(imported, pairs, min(threads, MAX_READERS)), "images read", len(pairs))
+    for (view, _), read in zip(pairs, reads, strict=True):
+        if isinstance(read, ImageError):
+            source.drop(view, read)
+            continue
+        posed.append((view, read[0]))
+        turned += [view.name] * read[1]
     source.require_most(min_share, known.files[0], images=True)
     missing = source.without_image
     views = [view for _, view in posed]
@@ -126,24 +136,20 @@ def _view_entries(
     return entries
 
 
-def _with_pixels(
-    view: KnownView, view_name: str, folder: Path, max_side_px: int, turned: list[str]
-) -> PosedView:
+def _with_pixels(view: KnownView, view_name: str, folder: Path, max_side_px: int) -> tuple[PosedView, bool]:
     """Read an image in the orientation of its camera, write the work image, and adapt the camera to it.
 
-    Append the name to `turned` if it is used as stored against its EXIF orientation.
+    Also return whether the image is used as stored, against its EXIF orientation.
     """
     folder.mkdir(parents=True, exist_ok=True)
     camera, cropped, as_stored = fitted_camera(view, max_side_px)
     pixels = _pixels_of(view, camera, as_stored=as_stored)
-    if as_stored:  # programs that label photographs turn them
-        turned.append(view.name)
-    else:
+    if not as_stored:  # otherwise, programs that label photographs turn them
         view.report["photo_hw_px"] = list(pixels.shape[:2] if cropped is None else cropped.size_hw)
     pixels = resize_to_fit(pixels, max_side_px)
     camera.rescale(pixels.shape[1], pixels.shape[0])
     write_png(folder / view_name, pixels)
-    return PosedView(view_name, folder / view_name, camera, view.cam_from_source, cropped)
+    return PosedView(view_name, folder / view_name, camera, view.cam_from_source, cropped), as_stored
 
 
 def _pixels_of(view: KnownView, camera: pycolmap.Camera, *, as_stored: bool) -> UInt8[np.ndarray, "H W 3"]:

@@ -297,6 +297,14 @@ def test_the_focal_length_scales_with_a_shrunk_and_rotated_picture(tmp_path):
     assert image.focal_px == pytest.approx(500 * 26 / 43.2666)
 
 
+def test_several_threads_keep_the_order_of_photographs_and_name_the_damaged_ones(tmp_path):
+    photos = [photograph(tmp_path / f"{row}.jpg", (40 - row, 30)) for row in range(9)]
+    photos[3].write_bytes(photos[3].read_bytes()[:200])
+    one, other = (prepare_images(photos, tmp_path / str(k), 800, 0.5, threads=k) for k in (1, 3))
+    assert one == other and [*one[1]] == [photos[3]]
+    assert [image.source for image in one[0]] == photos[:3] + photos[4:]
+
+
 @pytest.mark.parametrize(("unit", "resolution"), [(2, 2540), (3, 1000), (4, 100), (0, 2540)])
 def test_without_an_equivalent_the_sensor_resolution_is_used(tmp_path, unit, resolution):
     """100 px per mm: a lens of 5 mm is 500 px, in half the picture 250, in a tenth-size copy 50."""
