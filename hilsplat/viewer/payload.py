@@ -128,6 +128,7 @@ class FoundNode(TypedDict):
     node: int
     level: str
     score: float
+    name: str
 
 
 class Answer(TypedDict):
@@ -187,11 +188,13 @@ def _answer(
 ) -> Answer:
     """Return an answer; `first` has at least the first hit, since all of tens of thousands take seconds."""
     labels = [LEVELS[level - 1].label for level in scene.tree.level[list(nodes)]]
-    found = zip(nodes, labels, scores, strict=True)
     return {
         "text": text,
         "level": labels[0] if labels else "",
-        "hits": [{"node": node, "level": level, "score": round(score, 4)} for node, level, score in found],
+        "hits": [
+            {"node": node, "level": level, "score": round(score, 4), "name": scene.name_of(node)}
+            for node, level, score in zip(nodes, labels, scores, strict=True)
+        ],
         "best_views": [scene.views.names.index(view) for hit in first[:1] for view in hit.best_views],
         "relevancy": np.round(relevancy, 4).tolist(),
         "doubts": [],

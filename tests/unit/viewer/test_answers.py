@@ -166,7 +166,7 @@ def test_names_are_stored_and_matched_and_need_the_last_version(client, scene, d
     assert put("a > b", kept.json()["version"]).status_code == 422
     assert client.put("/api/names", json={"names": {}}).status_code == 412
     found = ask(client, "ATLAS <B")
-    assert [hit["node"] for hit in found["hits"]] == [node]
+    assert [hit["node"] for hit in found["hits"]] == [node] and found["hits"][0]["name"] == "atlas <b"
     assert client.get("/api/variant/default").json()["nodes"][node]["name"] == "atlas <b"
     assert put("", kept.json()["version"]).json()["names"] == {}
     (desk_project / SCENE / FILE).unlink()
