@@ -119,7 +119,9 @@ def figures(plan: Plan) -> list[str]:
     """Return panels, node names, masks against ground truth and, for sweep scenes, method comparisons."""
     paths = []
     for row in plan.scenes:
-        compared = not plan.run.sweep_scenes or row.scene in plan.run.sweep_scenes
+        # a scene of the user's may have the name of a benchmark scene
+        in_sweeps = bool(data_of(row)) and row.scene in plan.run.sweep_scenes
+        compared = in_sweeps or not plan.run.sweep_scenes
         generated = GENERATORS[row.generated.generator].pictures if row.generated else ()
         pictures = ["panel", *generated, *(["comparison"] if compared else [])]
         paths += [f"{plan.run.results}/figures/{row.name}/{picture}.webp" for picture in pictures]

@@ -379,6 +379,8 @@ def test_a_run_of_photographs_leaves_tables_alone(tmp_path):
         "results/figures/photos/desk/comparison.webp",
         "results/photos/desk/default/names",
     ]
+    requested = targets.default(plan(tmp_path, groups=["photos"], sweep_scenes=["desk"]))
+    assert not any("comparison" in path for path in requested)  # sweeps are over labelled benchmark scenes
     requested = targets.default(plan(tmp_path, sweep_scenes=["one"], theta_variants=["theta"]))
     assert "results/figures/synthetic/one/comparison.webp" in requested
     assert "results/figures/synthetic/two/comparison.webp" not in requested
