@@ -106,7 +106,7 @@ class GaussiansSettings(Section):
     half_until: Share = knob(0.75, "share of iterations that use images below full size", origin="3DGS: 0")
     sh_degree: int = knob(2, "degree of the spherical harmonics of the colours", ge=0, le=3, origin="3DGS: 3")
     ssim_weight: Share = knob(0.2, "D-SSIM's share of the loss; the rest is L1", origin="3DGS")
-    # A fit takes a fifteenth of the published number of steps, so each step must be larger (docs/splat.md).
+    # A fit takes at most a tenth of the published number of steps, so each step is larger (docs/splat.md).
     # config/paper.yaml uses the published number and sizes of steps.
     means_rate: float = knob(
         1.5e-3, "initial step size of the means", unit="camera extent", gt=0, origin="3DGS: 1.6e-4"
@@ -195,7 +195,7 @@ class MasksSettings(Section):
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",
-        "prompts per call on a CPU; auto: the model folder's value, else 8 (full-size SAM: 60 MB each)",
+        "prompts per call of an exported decoder on a CPU; auto: the model's, else 8 (60 MB each)",
         origin="LangSplat: 64",
     )
     crop_layers: int = knob(0, "layers of crops to segment", ge=0, le=2, origin="LangSplat: 1")

@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 logger = logging.getLogger(__name__)
 
 PARENT = "HILSPLAT_PARENT"
-"""Environment variable with the id of the Snakemake process; jobs end with it (workflow/run.py)."""
+"""Environment variable with host and id of the Snakemake process; jobs end with it (workflow/run.py)."""
 
 PR_SET_PDEATHSIG = 1  # from Linux's <sys/prctl.h>
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # from glibc's <malloc.h>
@@ -58,10 +58,18 @@ def _watch(parent: int) -> None:
     os._exit(1)
 
 
+def parent_variable() -> dict[str, str]:
+    """Return the environment variable with which jobs end with this process."""
+    return {PARENT: f"{host_token()}:{os.getpid()}"}
+
+
 def end_with_workflow() -> None:
-    """End this process with the Snakemake process that started it, if any."""
-    parent = os.environ.pop(PARENT, "")  # popped, because this process's children have a different parent
-    if parent.isdecimal():
+    """End this process with the Snakemake process that started it, if any.
+
+    A cluster passes the variable to jobs on other hosts, where the number means another process or none.
+    """
+    host, _, parent = os.environ.pop(PARENT, "").partition(":")  # this process's children have another parent
+    if host == host_token() and parent.isdecimal():
         end_with_parent(int(parent))
 
 

@@ -87,7 +87,7 @@ def int8_network(
         path = folder / ".int8" / f"{sha256_of_json([source.digest, RECIPE, list(exact)])}.onnx"
         if not path.is_file():
             logger.info(
-                "quantising %s of %s, which takes a few seconds; the result is kept", name, model.folder
+                "quantising %s of %s, which takes up to half a minute; the result is kept", name, model.folder
             )
             _quantise(source, path, exact)
         network = model.network(name, path)

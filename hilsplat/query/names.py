@@ -1,4 +1,4 @@
-"""User-given names of nodes, which queries match first and without a model.
+"""User-given names of nodes, which queries match first, whatever the model.
 
 `names.json` in a scene's folder stores the names under the digest of `tree.npz`, because row numbers of one
 tree are meaningless in other trees. If a tree is rebuilt, the previous tree's names are kept but not used.

@@ -127,7 +127,7 @@ class NodeQueries(ABC):
         return self.names.of_node.get(node, "") or vocabulary_name
 
     def caution_about(self, text: str) -> str:
-        """Return `caution`, or "" if every text of a query is a user-given name, which needs no CLIP."""
+        """Return `caution`, or "" if every text of a query is a user-given name, whatever the CLIP model."""
         return "" if all(self.names.nodes_of(part) for part in path_of(text)) else self.caution
 
     def node_margins(self, texts: Sequence[str], answerer: str = "tree") -> Float32[np.ndarray, "T n"]:

@@ -42,7 +42,7 @@ class SceneHit:
         size: lengths of the oriented box's sides.
         picture: the undistorted photograph in which the node is largest.
         doubts: texts of the query that may match nothing in this scene.
-        caution: as `LanguageScene.caution`, but empty if the query needed no model.
+        caution: as `LanguageScene.caution`, but empty if all texts are user-given names.
     """
 
     scene: str

@@ -27,7 +27,7 @@ import yaml
 from hilsplat.base.artifacts import RUN, write_json, write_text
 from hilsplat.base.errors import HilsplatError, SettingsError, nearest
 from hilsplat.base.files import INSTALLED, project_path
-from hilsplat.base.processes import PARENT, end_with_workflow, lock, remove_leftovers
+from hilsplat.base.processes import end_with_workflow, lock, parent_variable, remove_leftovers
 from hilsplat.base.removal import delete
 from hilsplat.configuration import CONFIG, SECTIONS, first_unusable, merged_config, parse_run, read_config
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, is_pattern, matches_of, read_sheet
@@ -63,7 +63,7 @@ def prepare_process() -> TextIOWrapper | None:
     """
     end_with_workflow()  # `hilsplat run` may have started this process
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
-    os.environ[PARENT] = str(os.getpid())
+    os.environ |= parent_variable()
     os.environ["PYTHONSAFEPATH"] = "1"  # jobs must not import modules from the working folder
     if os.environ.get(UNREGISTERED):
         return None
@@ -297,7 +297,7 @@ def _start(
 
 def _run(command: Sequence[str]) -> int:
     """Run a command that ends with this process, pass signals on to it, and return its exit status."""
-    child = subprocess.Popen(command, env={**os.environ, PARENT: str(os.getpid())})
+    child = subprocess.Popen(command, env=os.environ | parent_variable())
     forwarded = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
     is_interactive = sys.stdin is not None and sys.stdin.isatty()  # then, Ctrl-C reaches both processes
     handlers = {

@@ -55,8 +55,8 @@ time.sleep(60)
 """
 WORKFLOW = """
 import os, subprocess, sys
-os.environ["HILSPLAT_PARENT"] = str(os.getpid())
-job = subprocess.Popen(sys.argv[1], shell=True, stdout=sys.stdout)
+from hilsplat.base.processes import parent_variable
+job = subprocess.Popen(sys.argv[1], shell=True, stdout=sys.stdout, env=os.environ | parent_variable())
 print(job.pid, flush=True)
 job.wait()
 """
@@ -82,9 +82,18 @@ def test_a_job_ends_with_the_workflow_that_started_it(between):
 def test_a_job_does_not_start_once_its_workflow_has_ended():
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    environment = {**os.environ, "HILSPLAT_PARENT": str(gone.pid)}
+    environment = {**os.environ, PARENT: f"{host_token()}:{gone.pid}"}
     job = subprocess.run([sys.executable, "-c", JOB], env=environment, capture_output=True, check=False)
     assert job.returncode == 1 and job.stdout == b""
+
+
+def test_a_job_on_another_machine_of_a_cluster_runs(monkeypatch):
+    """Slurm passes the environment on, but the process that it names is on the login node."""
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    monkeypatch.setenv(PARENT, f"{'0' * 8}:{gone.pid}")
+    end_with_workflow()  # would end this process
+    assert PARENT not in os.environ
 
 
 def test_a_command_started_by_a_user_outlives_the_shell():
