@@ -74,7 +74,7 @@ def cuda() -> Iterator[Finding]:
 
     forget_cuda()
     if problem := cuda_problem() or kernel_problem():
-        fix = "on a machine with an NVIDIA GPU: install the extra gpu (docs/gpu.md), and a CUDA toolkit (nvcc)"
+        fix = "on a machine with an NVIDIA GPU: install the extra gpu and a CUDA toolkit (docs/gpu.md)"
         yield Finding("cuda", "note", f"{problem}: everything runs on the CPU", fix)
         return
     sound = "gsplat and the CPU agree on a step of a fit and pixel weights"

@@ -130,7 +130,7 @@ def require_cuda(problem: str | None) -> None:
             "device: cuda was requested but cannot be used",
             expected="a CUDA build of torch that finds a device, and gsplat",
             found=problem,
-            fix="install the extra gpu and a CUDA toolkit on a machine with a CUDA device (docs/gpu.md), or set "
+            fix="install the extra gpu and a CUDA toolkit on a machine with a card (docs/gpu.md), or set "
             "device: auto or cpu; after a change, run `hilsplat doctor`",
         )
 

@@ -15,7 +15,14 @@ from pathlib import Path
 import pytest
 
 from hilsplat.base.errors import HilsplatError
-from hilsplat.base.processes import in_order, in_own_process, in_processes
+from hilsplat.base.processes import (
+    PARENT,
+    end_with_workflow,
+    host_token,
+    in_order,
+    in_own_process,
+    in_processes,
+)
 
 
 def square(base: int, number: int) -> tuple[int, int]:
