@@ -7,7 +7,7 @@ import math
 import re
 import threading
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from PIL import ExifTags, Image, ImageCms, PngImagePlugin
 
 from hilsplat.base.atomic import atomic_path
 from hilsplat.base.errors import ImageError, foreign
+from hilsplat.base.files import stats_of
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +37,8 @@ HDR = re.compile(rb"colrnclx..\0[\x10\x12]|cICP.[\x10\x12]", re.DOTALL)
 
 MAX_PX = 2 * (Image.MAX_IMAGE_PIXELS or 0)  # Pillow refuses more in a file's first picture
 
-MAX_READERS = 4  # maximum number of threads that read photographs, each with the pixels of one
+MAX_READERS, READ_PX = 4, 100_000_000
+"""Maximum number of threads that read photographs at once, and of pixels that they may hold together."""
 
 MIN_SIDE_PX, MAX_ASPECT = 16, 20  # limits on photographs; all stages were run on 16 x 16 and 320 x 16 px
 
@@ -116,6 +118,15 @@ def image_size_hw(path: Path, *, upright: bool = False) -> tuple[int, int]:
         # Pillow states the upright size of a TIFF.
         is_other = orientation(image) > 4 and upright != (image.format == "TIFF")
         return (image.width, image.height) if is_other else (image.height, image.width)
+
+
+def num_readers(photos: Iterable[Path], threads: int) -> int:
+    """Return the number of threads that may read photographs at once, by the pixels of the largest file."""
+    sizes = {path: stat.st_size for path, stat in stats_of(photos).items()}
+    pixels = 1
+    with suppress(ImageError, OSError, ValueError):  # reading it reports the problem; there may be no file
+        pixels = math.prod(image_size_hw(max(sizes, key=sizes.__getitem__)))
+    return max(1, min(threads, MAX_READERS, READ_PX // pixels))
 
 
 def exif_tags(image: Image.Image, ifd: ExifTags.IFD | None = None) -> Mapping[int, Any]:

@@ -19,7 +19,7 @@ from jaxtyping import Float32, Float64, UInt8
 from hilsplat.base.errors import ImageError, first_line, shorten_list
 from hilsplat.base.files import list_files, list_images
 from hilsplat.base.images import (
-    MAX_READERS,
+    num_readers,
     opened_image,
     orientation,
     read_image,
@@ -175,7 +175,7 @@ def inspect_photos(folder: Path, posed: Sequence[Path] = ()) -> PhotoReport:
         is_matched = row in matched and not have_poses
         return checked_photo(name, pixels, focal_px, is_matched=is_matched), is_turned, sha256_of_file(path)
 
-    reads = in_order(inspected, range(len(photos)), min(MAX_READERS, os.cpu_count() or 1))
+    reads = in_order(inspected, range(len(photos)), num_readers(photos, os.cpu_count() or 1))
     for path, found in zip(photos, track(reads, "photographs checked", len(photos)), strict=True):
         if isinstance(found, str):
             unreadable.append((path.relative_to(folder).as_posix(), found))

@@ -11,8 +11,8 @@ from PIL import ExifTags
 
 from hilsplat.base.errors import ImageError
 from hilsplat.base.images import (
-    MAX_READERS,
     exif_tags,
+    num_readers,
     open_image,
     read_image,
     require_usable_size,
@@ -124,8 +124,8 @@ def prepare_images(
         return WorkImage(views[source], source, size_hw, exif_focal_px(source, size_hw), exif_time(source))
 
     views = dict(zip(sources, view_names(sources), strict=True))
-    reads = track(in_order(prepared, sources, min(threads, MAX_READERS)), "photographs read", len(sources))
-    found = dict(zip(sources, reads, strict=True))
+    reads = in_order(prepared, sources, num_readers(sources, threads))
+    found = dict(zip(sources, track(reads, "photographs read", len(sources)), strict=True))
     images = [image for image in found.values() if isinstance(image, WorkImage)]
     damaged = {source: reason for source, reason in found.items() if isinstance(reason, str)}
     if len(images) < min_share * len(sources):

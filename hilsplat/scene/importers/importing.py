@@ -11,8 +11,8 @@ from jaxtyping import Float32, Float64, UInt8
 from hilsplat.base.errors import ImageError, shorten_list
 from hilsplat.base.files import is_outside
 from hilsplat.base.images import (
-    MAX_READERS,
     image_size_hw,
+    num_readers,
     opened_image,
     orientation,
     read_image,
@@ -63,8 +63,8 @@ def import_poses(
             return error
 
     pairs = [*zip(with_image.values(), view_names([*with_image]), strict=True)]
-    reads = track(in_order(imported, pairs, min(threads, MAX_READERS)), "images read", len(pairs))
-    for (view, _), read in zip(pairs, reads, strict=True):
+    reads = in_order(imported, pairs, num_readers(with_image, threads))
+    for (view, _), read in zip(pairs, track(reads, "images read", len(pairs)), strict=True):
         if isinstance(read, ImageError):
             source.drop(view, read)
             continue

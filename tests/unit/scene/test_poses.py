@@ -11,6 +11,7 @@ import pytest
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
+from hilsplat.base import images
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.images import read_image
 from hilsplat.scene import mapping
@@ -303,6 +304,14 @@ def test_several_threads_keep_the_order_of_photographs_and_name_the_damaged_ones
     one, other = (prepare_images(photos, tmp_path / str(k), 800, 0.5, threads=k) for k in (1, 3))
     assert one == other and [*one[1]] == [photos[3]]
     assert [image.source for image in one[0]] == photos[:3] + photos[4:]
+
+
+def test_large_photographs_are_read_by_fewer_threads(tmp_path, monkeypatch):
+    photos = [photograph(tmp_path / "a.png", (10, 10)), photograph(tmp_path / "b.png", (400, 300))]
+    for most_px, number in ((10**9, 4), (3 * 400 * 300 - 1, 2), (1, 1)):
+        monkeypatch.setattr(images, "READ_PX", most_px)
+        assert images.num_readers(photos, 16) == number and images.num_readers(photos, 1) == 1
+    assert images.num_readers([tmp_path / "none.jpg"], 2) == 1
 
 
 @pytest.mark.parametrize(("unit", "resolution"), [(2, 2540), (3, 1000), (4, 100), (0, 2540)])
