@@ -1,12 +1,13 @@
 """Descriptions of data sets (scenes, layout, licence, reader), available without reading their files."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from hilsplat.base.errors import SceneError, shorten_list
+from hilsplat.base.files import IMAGE_SUFFIXES
 
 ABLATIONS = (
     *("ablation", "components", "cost", "cost-seconds", "pruning", "pruning-seconds"),
@@ -72,6 +73,10 @@ class Dataset:
     def needs(self, root: Path, scene: str) -> tuple[str, ...]:
         """Return the paths that a scene needs, relative to the data set's folder `root`."""
         return self.required(scene)
+
+    def num_images(self, files: Sequence[Path]) -> int:
+        """Return the number of images of a scene with point labels, from the files that it needs."""
+        return sum(path.suffix.lower() in IMAGE_SUFFIXES for path in files)
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
         """Return the required paths of a scene that are missing below the data set's folder `root`."""

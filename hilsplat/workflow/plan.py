@@ -474,7 +474,7 @@ class Plan:
             return False
         model = planned_model(Path(masks.model)) if masks.segmenter == "sam" else None
         is_slow = model is not None and not model.embedded
-        return is_slow and len(self.data.photographs(job)) >= MIN_PHOTOGRAPHS
+        return is_slow and self.data.num_images(job) >= MIN_PHOTOGRAPHS
 
     def masks_priority(self, job: VariantJob) -> int:
         """Return the priority of `masks`: lower if key views come first, or if cached masks get other levels.

@@ -269,8 +269,8 @@ class JobResources:
                 return Size(len(sizes), float(sizes.prod(axis=1).mean()) / 1e6)
         if row.generated:
             return Size(*GENERATORS[row.generated.generator].size(stages))
-        images = self.plan.data.photographs(row)
-        return Size(len(images), _first_mp(images, stages.poses.max_side_px))
+        first_mp = _first_mp(self.plan.data.photographs(row), stages.poses.max_side_px)
+        return Size(self.plan.data.num_images(row), first_mp)
 
     def _gaussians(self, row: SceneRow) -> int:
         """Return the number of Gaussians in the PLY that replaces the fit, or the limit of the fit."""

@@ -16,9 +16,9 @@ from typing import Any, Protocol, runtime_checkable
 from hilsplat.base.errors import ArtifactError, SettingsError, nearest
 from hilsplat.base.files import IMAGE_SUFFIXES, stats_of
 from hilsplat.base.lineage import digests_of, sha256_of_json
-from hilsplat.datasets.registry import readers_of
-from hilsplat.datasets.sources import absence, image_files, is_exported, label_files, label_sets
-from hilsplat.scene.layouts import dataparser_of, largest_copies, photo_files, transforms_of
+from hilsplat.datasets.registry import DATASETS, readers_of
+from hilsplat.datasets.sources import absence, image_files, is_exported, label_files, label_sets, published
+from hilsplat.scene.layouts import dataparser_of, largest_copies, photo_files, photo_folder, transforms_of
 from hilsplat.scene.sheet import DATA_PREFIX, SceneRow
 
 CATEGORY = b'"category"'  # key of the text of an object in a file of labels
@@ -64,6 +64,7 @@ class SceneData:
         # A thousand scenes have tens of thousands of jobs, so folders are read once.
         self.absence = functools.cache(lambda row: absence(row.source, data_root))
         self._folder_files = functools.cache(lambda row: [*map(portable, photo_files(row.folder, row.poses))])
+        self._photographs = functools.cache(lambda row: _images_of(row, self._folder_files(row)))
         self._digest = functools.cache(
             lambda memo, *files: sha256_of_json(digests_of(files, memo) if files else {})
         )
@@ -94,11 +95,15 @@ class SceneData:
         return self.path(job, "source") if is_exported(row.source) else self._folder_files(row)
 
     def photographs(self, job: Job) -> list[Path]:
-        """Return the photographs of a source folder, without smaller copies; else the files of the source."""
-        files = self.image_files(job)
-        if isinstance(files, str):
-            return [Path(path) for path in self.source_files(job)]
-        return largest_copies([path for path in map(Path, files) if path.suffix.lower() in IMAGE_SUFFIXES])
+        """Return the photographs of a source folder, without copies; else the files of the source."""
+        row = self.row(job)
+        return [*map(Path, self.source_files(job))] if is_exported(row.source) else self._photographs(row)
+
+    def num_images(self, job: Job) -> int:
+        """Return the number of photographs, as far as files tell."""
+        source, files = self.row(job).source, self.photographs(job)
+        names = published(source) if is_exported(source) else None
+        return DATASETS[names[0]].num_images(files) if names else len(files)
 
     def content(self, files: Callable[[Any], str | list[str]]) -> Callable[[Job], str]:
         """Return the parameter function for the digest of a user's files; Snakemake compares only times."""
@@ -219,6 +224,14 @@ class SceneData:
         """Return the labels for queries and outlines in figures, which must be on images, if any."""
         labels = [name for name in self.labels(self.row(job)) if not is_exported(f"{DATA_PREFIX}{name}")]
         return labels[-1] if labels else ""
+
+
+def _images_of(row: SceneRow, files: Iterable[str]) -> list[Path]:
+    """Return the photographs among the files of a source, without copies in other folders."""
+    images = largest_copies([path for path in map(Path, files) if path.suffix.lower() in IMAGE_SUFFIXES])
+    assert row.folder is not None  # as of all sources with photographs
+    folder = Path(portable(photo_folder(row.folder)))
+    return [path for path in images if folder in path.parents] or images
 
 
 def _require_past(files: Sequence[str]) -> None:

@@ -12,6 +12,8 @@ All readers raise SceneError if a file is missing, damaged, or doesn't match the
 Poses are camera-to-world in OpenCV axes, 16 numbers per line.
 """
 
+from collections.abc import Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -34,6 +36,8 @@ from hilsplat.datasets.points.labelled_points import (
     read_matrices,
 )
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
+
+LENS = "cam_params.json"
 
 LAYOUTS = (("traj.txt", "results", "frame"), ("traj_w_c.txt", "rgb", "rgb_"))
 """Pose file, image folder and image name prefix, for NICE-SLAM, then for Semantic-NeRF and vMAP."""
@@ -97,7 +101,7 @@ def read_images(root: Path, scene: str) -> tuple[tuple[PosedImage, ...], tuple[s
             found=f"{len(poses)} lines, {len(frames)} images{missing}",
             fix=UNPACK_AGAIN,
         )
-    lens = folder.parent / "cam_params.json"
+    lens = folder.parent / LENS
     if pose_file == "traj.txt" and lens.is_file():
         K, size_hw = read_lens(lens)
     else:  # the renderings' stated centre, 599.5 of 1200 px, is relative to the first pixel's centre
@@ -175,7 +179,30 @@ def open_scene(root: Path, scene: str) -> PointScene:
     return PointScene(scene, images, {"replica": truth}, warnings)
 
 
-DATASET = Dataset(
+class Rooms(Dataset):
+    """Replica, whose rendered sequences are in one of several places."""
+
+    def needs(self, root: Path, scene: str) -> tuple[str, ...]:
+        """Return the labels of a room, and the poses, images and lens of its rendered sequence."""
+        folder, (poses, images, _) = root / scene.replace("_", ""), LAYOUTS[0]
+        with suppress(SceneError):  # the first layout's paths are named as missing
+            folder, (poses, images, _) = find_sequence(root, scene)
+        lens = folder.parent / LENS
+        paths = [folder / poses, folder / images, *([lens] if lens.is_file() else [])]
+        return (*self.required(scene), *(path.relative_to(root).as_posix() for path in paths))
+
+    def require(self, root: Path, scene: str) -> None:
+        """Raise SceneError if the labels are missing, or else the sequence, with the possible places."""
+        if all((root / name).exists() for name in self.required(scene)):
+            find_sequence(root, scene)
+        super().require(root, scene)
+
+    def num_images(self, files: Sequence[Path]) -> int:
+        """Count frames, without depth and other maps."""
+        return sum(path.stem.startswith(tuple(prefix for _, _, prefix in LAYOUTS)) for path in files)
+
+
+DATASET = Rooms(
     name="replica",
     title="Replica",
     labels="points",

@@ -5,6 +5,7 @@ the vehicle at the segment's first frame, because positions in the files (kilome
 for float32.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from hilsplat.scene.posed_images import rigid_pose
 SPLITS = ("validation", "training")
 """Splits searched for a segment. Labels of the testing split are not public."""
 LABELS = "lidar_segmentation"
+NUM_IMAGES = 990  # of a segment: 198 frames of five cameras
 
 
 def find_parquet(root: Path, segment: str) -> Path | None:
@@ -92,6 +94,10 @@ class Segments(Dataset):
             return (str(record.relative_to(root)),)
         paths = [parquet.component_path(split or root / SPLITS[0], tag, scene) for tag in parquet.COMPONENTS]
         return tuple(str(path.relative_to(root)) for path in paths)
+
+    def num_images(self, files: Sequence[Path]) -> int:
+        """Return the usual number, because the images are inside the files."""
+        return NUM_IMAGES if files else 0
 
 
 DATASET = Segments(
