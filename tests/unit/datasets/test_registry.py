@@ -25,6 +25,9 @@ def touch(*paths: Path) -> None:
         path.write_bytes(b"x")
 
 
+KINDS = (("frame", "jpg"), ("depth", "png"))  # of NICE-SLAM's renderings
+
+
 @pytest.fixture
 def root(tmp_path) -> Path:
     """One scene of LERF-OVS and Hi-LERF, and one of 3D-OVS; their files are not readable."""
@@ -144,6 +147,22 @@ def test_scenes_with_labelled_points_are_exported_first(root):
     assert not sources.is_exported("data:lerf_ovs/figurines")
     files = sources.image_files("data:scannet/scene0000_00", str(root))
     assert files == (scan / "color/0.jpg", scan / "pose/0.txt")  # labels are read by evaluation alone
+
+
+def test_replica_needs_its_renderings_and_counts_frames(root):
+    source, room = "data:replica/room_0", root / "replica/room_0"
+    touch(room / "habitat/mesh_semantic.ply", room / "habitat/info_semantic.json")
+    assert "no rendered sequence" in sources.absence(source, str(root))  # the original release alone
+    sequence = root / "replica/room0"
+    frames = [
+        sequence / f"results/{kind}{number:06}.{ending}" for number in range(3) for kind, ending in KINDS
+    ]
+    files = {sequence / "traj.txt", root / "replica/cam_params.json", *frames}
+    touch(*files)
+    assert sources.absence(source, str(root)) is None
+    assert set(sources.image_files(source, str(root))) == files
+    assert dataset_of("replica").num_images([*files]) == 3
+    assert dataset_of("replica").found(root / "replica") == ("room_0",)
 
 
 def test_unknown_data_sets_missing_scene_names_and_needless_exports_are_refused(root, monkeypatch):

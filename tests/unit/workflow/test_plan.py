@@ -335,6 +335,19 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
     assert not plan(tmp_path, **(config | {"variants": {}})).first_answer(desk)
 
 
+@pytest.mark.parametrize("beside", ["input", "images_train", "object_mask", "images_4"])
+def test_other_copies_of_photographs_are_not_counted(tmp_path, beside):
+    for folder in ("sparse/0", "images", beside):
+        (tmp_path / "desk" / folder).mkdir(parents=True)
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        (tmp_path / "desk/sparse/0" / name).touch()
+    for number in range(4):
+        for folder in ("images", beside):
+            (tmp_path / f"desk/{folder}/{number}.png").touch()
+    found = plan(tmp_path, groups=["photos"])
+    assert found.data.num_images(Job("photos", "desk")) == 4
+
+
 def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
     (tmp_path / "desk").mkdir()
     (tmp_path / "desk/.hidden").touch()
