@@ -13,6 +13,7 @@ The names in `__all__` are the public interface (docs/python.md); everything els
 package loads no large library.
 """
 
+import os
 import sys
 from importlib import import_module
 from types import ModuleType
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
     from hilsplat.splat.gaussians import Gaussians
     from hilsplat.splat.rasterise.api import Rendering, render
     from hilsplat.viewer.app import show
+
+# Read when onnxruntime is imported: its telemetry would start a thread and write a device id to the home folder.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 __all__ = [
     "Camera",

@@ -1,7 +1,10 @@
 """A model's files, variants and preprocessing, and splitting of a whole CLIP."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import onnx
@@ -211,3 +214,12 @@ def test_published_forms_are_accepted(tmp_path, content, side):
 
 def test_the_side_of_the_input_is_the_padded_one(sam):
     assert input_side_px(open_model_folder(sam)) == 384
+
+
+def test_the_telemetry_of_onnxruntime_is_off(tmp_path):
+    code = "import numpy, os; before = len(os.listdir('/proc/self/task'))"
+    code += "; import hilsplat.models.network; print(len(os.listdir('/proc/self/task')) - before)"
+    inherited = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    environment = {**inherited, "HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    printed = subprocess.check_output([sys.executable, "-c", code], text=True, env=environment)
+    assert printed.split() == ["0"] and list(tmp_path.rglob("*")) == []
