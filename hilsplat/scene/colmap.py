@@ -5,9 +5,10 @@ Pillow corrupts the heap, and the process aborts or hangs. The reverse order wor
 SIGTERM, which reports a crash if a job is cancelled, is replaced by the former one.
 """
 
+import ctypes
 import signal
+import sys
 from collections.abc import Sequence
-from contextlib import suppress
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -15,13 +16,16 @@ from PIL import Image  # noqa: F401
 
 from hilsplat.scene.cameras import Photo
 
-_on_sigterm = signal.getsignal(signal.SIGTERM)
+_libc = ctypes.CDLL(None) if sys.platform != "win32" else None
+_on_sigterm = ctypes.create_string_buffer(512)  # `struct sigaction` has 152 bytes on Linux, fewer on macOS
+if _libc:  # Python's own `signal.signal` works only in the main thread
+    _libc.sigaction(signal.SIGTERM, None, _on_sigterm)
 
 # isort: split
 import pycolmap as pycolmap  # noqa: E402
 
-with suppress(ValueError):  # this is not the main thread
-    signal.signal(signal.SIGTERM, _on_sigterm)
+if _libc:
+    _libc.sigaction(signal.SIGTERM, _on_sigterm, None)
 
 Points = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]  # positions and colours
 

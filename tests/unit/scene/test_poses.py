@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 from itertools import product
 from pathlib import Path
 
@@ -330,3 +332,18 @@ def test_without_an_equivalent_the_sensor_resolution_is_used(tmp_path, unit, res
 def test_without_usable_tags_there_is_no_focal_length(tmp_path, focal, film):
     path = photograph(tmp_path / "a.jpg", FocalLength=focal, FocalLengthIn35mmFilm=film)
     assert exif_focal_px(path, (300, 400)) is None
+
+
+@pytest.mark.parametrize("start", ["load()", "thread = Thread(target=load); thread.start(); thread.join()"])
+def test_pycolmap_does_not_replace_the_handler_of_sigterm(start):
+    lines = (
+        "import signal",
+        "from importlib import import_module",
+        "from threading import Thread",
+        "signal.signal(signal.SIGTERM, lambda *_: print('handled'))",
+        "load = lambda: import_module('hilsplat.scene.colmap')",
+        start,
+        "signal.raise_signal(signal.SIGTERM)",
+    )
+    printed = subprocess.check_output([sys.executable, "-c", "\n".join(lines)], text=True)
+    assert printed == "handled\n"
