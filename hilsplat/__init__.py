@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from hilsplat.splat.rasterise.api import Rendering, render
     from hilsplat.viewer.app import show
 
-# Read when onnxruntime is imported: its telemetry would start a thread and write a device id to the home folder.
+# onnxruntime reads it when imported: its telemetry starts a thread and writes a device id to the home folder.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 __all__ = [

@@ -4,7 +4,6 @@
 signature, by the types below; commands, parameters of rules, digests of code and provenance derive from it.
 """
 
-import dis
 import hashlib
 import inspect
 import os
@@ -23,7 +22,7 @@ from hilsplat.base.artifacts import provenance_path
 from hilsplat.base.atomic import output_lock, require_free_space, was_interrupted
 from hilsplat.base.cache import writable
 from hilsplat.base.cards import take_card
-from hilsplat.base.code import code_digest, modules_of, statements_of
+from hilsplat.base.code import code_digest, imports_of, modules_of, statements_of
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.lineage import Inputs, write_provenance
 from hilsplat.base.ownership import require_replaceable
@@ -175,18 +174,12 @@ class Stage(Generic[P, R]):
 
     def modules(self) -> list[str]:
         """Return the modules that the function imports, directly or not."""
-        return modules_of(*self.imports)
+        return modules_of(*imports_of(self.function))
 
     def code_digest(self, plugins: Sequence[str] = ()) -> str:
         """Return the digest of the function, its modules, and the plugins that a call uses."""
-        text = statements_of(self.function) + code_digest(*self.imports, *plugins)
+        text = statements_of(self.function) + code_digest(*imports_of(self.function), *plugins)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-    @cached_property
-    def imports(self) -> list[str]:
-        """Names of the modules that the function itself imports."""
-        steps = dis.get_instructions(inspect.unwrap(self.function).__code__)
-        return [step.argval for step in steps if step.opname == "IMPORT_NAME"]
 
 
 @dataclass

@@ -13,7 +13,7 @@ import json
 import sys
 import textwrap
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -65,9 +65,19 @@ def modules_of(*roots: Code) -> list[str]:
 
 def statements_of(function: Callable[..., Any]) -> str:
     """Return a function's statements as text, without its docstring and comments."""
+    return "\n".join(map(ast.unparse, _definition(function).body))
+
+
+def imports_of(function: Callable[..., Any]) -> list[str]:
+    """Return the modules that a function's body imports, of `PACKAGES` and of the function's own package."""
+    packages = {*PACKAGES, function.__module__.partition(".")[0]}
+    package = sys.modules[function.__module__].__package__ or ""
+    return sorted({*_followed(_imported(_definition(function), package), packages)})
+
+
+def _definition(function: Callable[..., Any]) -> ast.FunctionDef:
     with PARSING:
-        tree = _Bare().visit(ast.parse(textwrap.dedent(inspect.getsource(function))))
-    return "\n".join(map(ast.unparse, tree.body[0].body))
+        return _Bare().visit(ast.parse(textwrap.dedent(inspect.getsource(function)))).body[0]
 
 
 def _digests(roots: tuple[Code, ...]) -> dict[str, str]:
@@ -89,8 +99,7 @@ def _closure(roots: tuple[str, ...]) -> dict[str, str]:
         if path is None or module in facts or module in NEUTRAL:
             continue
         facts[module] = _facts(module, path, memo.get(module))
-        names = (name for name in facts[module].imports if name.partition(".")[0] in packages)
-        waiting += [name if _file(name) else name.rpartition(".")[0] or name for name in names]
+        waiting += _followed(facts[module].imports, packages)
     if not facts.items() <= memo.items():
         memo.update(facts)
         # The package may be read-only.
@@ -145,6 +154,13 @@ def _structure(node: Any) -> Any:
     if isinstance(node, list):
         return [_structure(part) for part in node]
     return [node] if isinstance(node, str) else repr(node)
+
+
+def _followed(imported: Iterable[str], packages: Collection[str]) -> Iterator[str]:
+    """Yield the modules of these packages among the names of imported modules and objects."""
+    for name in imported:
+        if name.partition(".")[0] in packages:
+            yield name if _file(name) else name.rpartition(".")[0] or name
 
 
 def _imported(tree: ast.AST, package: str) -> Iterator[str]:

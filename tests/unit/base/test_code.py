@@ -7,6 +7,7 @@ import functools
 import inspect
 import json
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -79,6 +80,27 @@ def test_relative_imports_start_at_the_package_and_modules_may_have_none(tmp_pat
     assert modules_of("alone:f") == ["alone"]
     with pytest.raises(HilsplatError, match=r"there is no module plug\.zzz"):
         code_digest("plug.zzz:f")
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("from plug.sub import b", ["plug.sub.b"]),
+        ("from plug.sub.b import f", ["plug.sub.b"]),
+        ("from ..c import f", ["plug.c"]),
+        ("from . import b", ["plug.sub.b"]),
+        ("import numpy, hilsplat.base.errors", ["hilsplat.base.errors"]),
+    ],
+)
+@pytest.mark.usefixtures("forget")
+def test_a_stage_covers_modules_that_its_body_imports_in_any_form(tmp_path, line, expected):
+    text = "from hilsplat.stage import PathOut, Registry\nPIPELINE = Registry()\n"
+    text += f'@PIPELINE.stage()\ndef count(out: PathOut) -> None:\n    """Count."""\n    {line}\n'
+    write(tmp_path, sub_stages=text, sub_b="", c="")
+    found = load("plug.sub.stages:PIPELINE").stages["count"].modules()
+    for name in ("plug", "plug.sub", "plug.sub.stages"):
+        del sys.modules[name]
+    assert found == expected
 
 
 BEFORE = '''"""Module."""
