@@ -322,11 +322,15 @@ def _snakemake(command: Sequence[str], *words: str) -> subprocess.CompletedProce
 
 
 def _snakefile(configs: Sequence[Path]) -> Path:
-    """Return the Snakefile next to the configuration, otherwise the installed one."""
+    """Return the Snakefile of the checkout that has the configuration, otherwise the installed one.
+
+    A user's own Snakefile may be next to the configuration, too, but not next to our rules.
+    """
     beside = [
         folder for path in (CONFIG, *configs) if path.is_file() for folder in path.resolve().parents[:2]
     ]
-    return next(folder / "Snakefile" for folder in [*beside, INSTALLED] if (folder / "Snakefile").is_file())
+    ours = (folder for folder in beside if (folder / "rules/semantic_tree.smk").is_file())
+    return next(ours, INSTALLED) / "Snakefile"
 
 
 def _has(words: Sequence[str], *options: str) -> bool:

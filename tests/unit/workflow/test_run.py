@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -35,7 +36,6 @@ def folder(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     write_sheet(tmp_path / "config/scenes.tsv")
     Path("config/config.yaml").write_text("variants: {}\n")
-    Path("Snakefile").write_text("")
     return tmp_path
 
 
@@ -266,12 +266,15 @@ def test_a_setting_that_overrides_replace_in_all_scenes_is_refused_or_reported(f
     assert re.search(line, caplog.text)
 
 
-def test_the_snakefile_is_beside_the_configuration_or_the_installed_one(
-    folder, project, started, monkeypatch
+def test_the_snakefile_is_of_the_checkout_with_the_configuration_or_the_installed_one(
+    folder, project, started
 ):
-    Path("elsewhere").mkdir()
-    monkeypatch.chdir("elsewhere")
-    runs.run([], [folder / "config/config.yaml"], ["-n"])
+    for path in (Path("Snakefile"), Path("rules/common.smk")):  # of the user
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("")
+    shutil.copytree(folder, "checkout")
+    Path("checkout/rules/semantic_tree.smk").touch()
     runs.run([], [], ["-n"])
+    runs.run([], [folder / "checkout/config/config.yaml"], ["-n"])
     found = [value(command, "--snakefile") for command in started]
-    assert found == [str(folder / "Snakefile"), str(project / "Snakefile")]
+    assert found == [str(project / "Snakefile"), str(folder / "checkout/Snakefile")]

@@ -104,7 +104,6 @@ def ended(project, monkeypatch, caplog) -> Callable[..., str]:
     """A function that runs a scene without Snakemake, and returns the log."""
     plan_of(project, ROWS, groups=["photos"])
     Path("config/config.yaml").write_text("groups: [photos]\n")
-    Path("Snakefile").write_text("")
     monkeypatch.setattr(runs, "outdated", lambda *_, **__: {})
     caplog.set_level("INFO")
 
