@@ -13,12 +13,13 @@ import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
+from threadpoolctl import OpenBLASController, ThreadpoolController
 
 from hilsplat import settings as of
 from hilsplat import stages
@@ -33,6 +34,7 @@ from hilsplat.base.errors import (
     shorten_list,
 )
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.processes import Shared
 from hilsplat.base.progress import reporting, track
 from hilsplat.configuration import resolve_auto, validated
 from hilsplat.models.store import AUTO
@@ -330,8 +332,25 @@ def _require_own(folder: Path | str | None) -> None:
 @contextmanager
 def _running(progress: bool) -> Iterator[None]:
     """Report progress, and sum in linear algebra libraries in one thread, as commands do for equal bytes."""
-    with reporting(progress), threadpool_limits(1):
+    openmp = ThreadpoolController().select(user_api="openmp").limit(limits=1)  # of this thread only
+    with reporting(progress), openmp, _ONE_BLAS_THREAD:
         yield
+
+
+@contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    release = partial(OpenBLASController.clear_controlling_thread, force=True)
+    release()  # threadpoolctl ignores limits from other threads than the first one that set a limit
+    limit = ThreadpoolController().select(user_api="blas").limit(limits=1)
+    try:
+        yield
+    finally:
+        release()
+        limit.restore_original_limits()
+        release()
+
+
+_ONE_BLAS_THREAD = Shared(_one_blas_thread)
 
 
 @contextmanager

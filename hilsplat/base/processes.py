@@ -1,4 +1,4 @@
-"""Child processes that end with their parent, file locks, unfinished files, and process and thread pools."""
+"""Child processes that end with their parent, locks, unfinished files, state of the process, and pools."""
 
 import ctypes
 import functools
@@ -13,9 +13,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
-from threading import Thread
+from threading import Lock, Thread
 from typing import IO, Any, TypeVar
 
 from hilsplat.base.errors import KILLED, KILLED_FIX, HilsplatError
@@ -84,6 +84,29 @@ def keep_freed_memory() -> None:
             set_option = ctypes.CDLL(None).mallopt
             set_option(M_MMAP_THRESHOLD, 32 << 20)
             set_option(M_TRIM_THRESHOLD, 128 << 20)
+
+
+class Shared:
+    """A context that changes the state of the process, for calls that overlap in several threads.
+
+    The first call enters it, and the last one leaves it. If each call saved and restored the state itself,
+    a later call would restore the changed state of an earlier one.
+    """
+
+    def __init__(self, context: Callable[[], AbstractContextManager[Any]]) -> None:
+        self._context, self._lock, self._calls, self._stack = context, Lock(), 0, ExitStack()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._calls == 0:
+                self._stack.enter_context(self._context())
+            self._calls += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._calls -= 1
+            if self._calls == 0:
+                self._stack.close()
 
 
 def lock(stream: IO[Any], *, shared: bool = False, wait: bool = True) -> None:

@@ -6,12 +6,13 @@ import re
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sized
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TypeVar
 
 from hilsplat.base.errors import visible
+from hilsplat.base.processes import Shared
 
 Item = TypeVar("Item")
 logger = logging.getLogger(__name__)
@@ -87,18 +88,29 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
 @contextmanager
 def reporting(progress: bool) -> Iterator[None]:
     """Print what the block does to stderr; without `progress`, only what loggers of the user print."""
+    bars = BARS.set(progress)
+    try:
+        with _LOGGED if progress else nullcontext():
+            yield
+    finally:
+        BARS.reset(bars)
+
+
+@contextmanager
+def _logged() -> Iterator[None]:
     logs, handler = logging.getLogger("hilsplat"), logging.StreamHandler()
     handler.setFormatter(LogFormatter("%(message)s"))
-    level, bars = logs.level, BARS.set(progress)
-    if progress:
-        logs.addHandler(handler)
-        logs.setLevel(logging.INFO)
+    level = logs.level
+    logs.addHandler(handler)
+    logs.setLevel(logging.INFO)
     try:
         yield
     finally:
-        BARS.reset(bars)
         logs.removeHandler(handler)
         logs.setLevel(level)
+
+
+_LOGGED = Shared(_logged)
 
 
 @contextmanager

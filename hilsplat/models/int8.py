@@ -101,7 +101,8 @@ def _quantise(source: Graph, out: Path, exact: Sequence[str]) -> None:
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
     graph = source.complete()
-    logging.disable(logging.WARNING)  # onnxruntime logs a line for each layer that stays in float32
+    # onnxruntime logs a line for each layer that stays in float32, with functions of `logging` itself
+    logging.getLogger().addFilter(_is_error)
     try:
         with atomic_path(out) as temporary:
             quantize_dynamic(
@@ -113,7 +114,11 @@ def _quantise(source: Graph, out: Path, exact: Sequence[str]) -> None:
                 nodes_to_exclude=_nodes_only_for(graph.graph, exact),
             )
     finally:
-        logging.disable(logging.NOTSET)
+        logging.getLogger().removeFilter(_is_error)
+
+
+def _is_error(record: logging.LogRecord) -> bool:
+    return record.levelno >= logging.ERROR
 
 
 def _nodes_only_for(graph: Any, outputs: Sequence[str]) -> list[str]:

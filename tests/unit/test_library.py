@@ -12,10 +12,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from threading import Barrier, Event
 from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import hilsplat
 from hilsplat import stages
@@ -256,6 +258,34 @@ def test_progress_is_reported_only_on_request(scene, capsys, monkeypatch):
     assert capsys.readouterr().err == ""
     hilsplat.segment(scene, segmenter="graph", progress=True)
     assert "masks of views" in capsys.readouterr().err
+
+
+def test_overlapping_calls_leave_the_process_as_it_was(scene, monkeypatch):
+    both_run, first_ended, during = Barrier(2), Event(), []
+
+    def segment_views(scene, views, cache, section, threads):
+        both_run.wait()
+        if threads == 2:
+            first_ended.wait()
+            during.append((logs.level, blas_threads()))
+        return [], {}
+
+    def blas_threads():
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    monkeypatch.setattr("hilsplat.library.segment_views", segment_views)
+    logs = logging.getLogger("hilsplat")
+    with ThreadPoolExecutor(2) as pool, threadpool_limits(2):
+        before = logs.level, list(logs.handlers), blas_threads()
+        first, second = (
+            pool.submit(hilsplat.segment, scene, segmenter="graph", progress=True, threads=threads)
+            for threads in (1, 2)
+        )
+        first.result()
+        first_ended.set()
+        second.result()
+        assert (logs.level, logs.handlers, blas_threads()) == before
+    assert during == [(logging.INFO, {1})]
 
 
 SCRIPT = """

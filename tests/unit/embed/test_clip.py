@@ -1,6 +1,7 @@
 """CLIP folders, crops and texts, with hand-made networks whose vectors can be computed by hand."""
 
 import json
+import logging
 from pathlib import Path
 from unittest.mock import Mock, patch
 
@@ -141,7 +142,7 @@ def test_a_tree_without_nodes_chooses_every_mask(tmp_path):
 
 @pytest.mark.parametrize(("largest", "precision"), [(1.0, "int8"), (1e4, "fp32")])
 def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
-    red_scene, colour_clip, tmp_path, largest, precision, caplog
+    red_scene, colour_clip, tmp_path, largest, precision, caplog, monkeypatch
 ):
     scene, masks = red_scene
     # int8 has 127 steps up to the largest weight of an output, here of a pixel that is black in every crop:
@@ -155,8 +156,11 @@ def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
     }"""
     save_network(colour_clip / "vision_model.onnx", text, weights=weights)
     settings = ClipSettings(model=str(colour_clip))
+    monkeypatch.setattr(logging.root.manager, "disable", logging.DEBUG)  # by the user
     with caplog.at_level("INFO"):
         run_clip(scene, masks, None, tmp_path / "auto", tmp_path / "cache", settings, threads=1)
+    assert logging.root.manager.disable == logging.DEBUG
+    assert {record.name.partition(".")[0] for record in caplog.records} == {"hilsplat"}
     assert read_index(tmp_path / "auto")["precision"] == precision
     assert f"CLIP runs in {'int8' if precision == 'int8' else 'float32'}" in caplog.text
     always = settings.model_copy(update={"precision": "fp32"})
