@@ -11,11 +11,11 @@ import logging
 import os
 import weakref
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ from hilsplat.base.errors import (
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.processes import Shared
 from hilsplat.base.progress import reporting, track
+from hilsplat.base.removal import delete
 from hilsplat.configuration import resolve_auto, validated
 from hilsplat.models.store import AUTO
 from hilsplat.photos.intake import prepared_photographs
@@ -355,9 +356,16 @@ _ONE_BLAS_THREAD = Shared(_one_blas_thread)
 
 @contextmanager
 def _folder(path: Path | str | None) -> Iterator[Path]:
-    """Yield the folder, or a temporary one."""
-    with nullcontext(path) if path else TemporaryDirectory(prefix="hilsplat-") as folder:
-        yield Path(folder).absolute()
+    """Yield the folder, or a temporary one, which only the process that created it deletes."""
+    if path:
+        yield Path(path).absolute()
+        return
+    folder, creator = Path(mkdtemp(prefix="hilsplat-")).absolute(), os.getpid()
+    try:
+        yield folder
+    finally:
+        if os.getpid() == creator:  # a forked process also has the object
+            delete(folder, "hilsplat-.+")
 
 
 def _require_seed(seed: int) -> None:

@@ -219,6 +219,11 @@ def test_files_of_imported_poses_are_deleted_with_the_scene(desk, tmp_path, temp
         - hilsplat.render(hilsplat.load_gaussians(desk / "gaussians.ply"), own).colours
     )
     assert np.abs(difference).mean() < 0.01
+    if (child := os.fork()) == 0:
+        del imported
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert folder.exists()
     del imported
     assert not folder.exists() and not list(temporary.iterdir())
     kept = hilsplat.load_scene(exported, folder=tmp_path / "results/photos/kept")
