@@ -13,6 +13,7 @@ import os
 import re
 import shutil
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -48,8 +49,8 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 def _folder_of(package: str) -> str:
     """Return the folder for a package's machine code; delete folders that have long been unused.
 
-    It is in `NUMBA_CACHE_DIR` if that is set, else in the package if it can be written, else in the user's
-    cache folder.
+    It is in `NUMBA_CACHE_DIR` if that is set, else in the first folder that can be written: the package, the
+    user's cache folder, or a private one among the temporary files.
     """
     this_package = Path(__file__).parent
     root = Path(next(iter(getattr(sys.modules.get(package), "__path__", [this_package]))))
@@ -59,11 +60,7 @@ def _folder_of(package: str) -> str:
         # with the time: if a file is edited while a process starts, and restored later, it counts as new
         stamp = f"{file.parent.name}/{file.name} {file.stat().st_mtime_ns}\n"
         digest.update(stamp.encode() + file.read_bytes())
-    parent = root / "__pycache__"
-    if config.CACHE_DIR:
-        parent = Path(config.CACHE_DIR)
-    elif not os.access(parent if parent.exists() else root, os.W_OK):
-        parent = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "cpusplat"
+    parent = Path(config.CACHE_DIR) if config.CACHE_DIR else _writable_parent(root)
     folder = parent / f"kernels-{digest.hexdigest()[:16]}"
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
@@ -73,6 +70,23 @@ def _folder_of(package: str) -> str:
             if _FOLDER.fullmatch(other.name) and idle_days > MAX_IDLE_DAYS:
                 shutil.rmtree(other, ignore_errors=True)
     return str(folder)
+
+
+def _writable_parent(root: Path) -> Path:
+    beside = root / "__pycache__"
+    if os.access(beside if beside.exists() else root, os.W_OK):
+        return beside
+    with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
+        of_user = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "cpusplat"
+        of_user.mkdir(parents=True, exist_ok=True)
+        if os.access(of_user, os.W_OK):
+            return of_user
+    temporary = Path(tempfile.gettempdir(), f"cpusplat-{os.getuid()}")
+    with suppress(FileExistsError):
+        temporary.mkdir(mode=0o700)
+    stat = temporary.lstat()
+    is_ours = stat.st_uid == os.getuid() and not stat.st_mode & 0o077  # a link has all permissions
+    return temporary if is_ours else Path(tempfile.mkdtemp(prefix="cpusplat-"))
 
 
 def _kernel_modules(root: Path) -> Iterator[Path]:

@@ -1,5 +1,6 @@
 """Caches: finished views and checkpoints, their sizes and pruning, and examinations of this machine."""
 
+import functools
 import logging
 import os
 import re
@@ -160,18 +161,13 @@ def use_writable_cache() -> None:
 
     They would fail otherwise: numba, Snakemake and Matplotlib, in containers without a home.
     """
-    wanted = Path("~/.cache")
-    with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
-        wanted = platformdirs.user_cache_path()
-        wanted.mkdir(parents=True, exist_ok=True)
-        if os.access(wanted, os.W_OK):
-            return
-    folder = Path(tempfile.gettempdir()) / f"hilsplat-{os.getuid()}"
-    with suppress(FileExistsError):
-        folder.mkdir(mode=0o700)
-    stat = folder.lstat()
-    if stat.st_uid != os.getuid() or stat.st_mode & 0o022:  # not ours
-        folder = Path(tempfile.mkdtemp(prefix="hilsplat-"))
+    wanted = platformdirs.user_cache_path()
+    with suppress(OSError):
+        if wanted.is_absolute():
+            wanted.mkdir(parents=True, exist_ok=True)
+            if os.access(wanted, os.W_OK):
+                return
+    folder = _private_folder(tempfile.gettempdir())
     os.environ["XDG_CACHE_HOME"] = os.environ["MPLCONFIGDIR"] = str(folder)
     os.environ.setdefault("HOME", str(folder))
     os.environ.setdefault("LOGNAME", str(os.getuid()))  # a user without a name
@@ -188,4 +184,16 @@ def writable(folder: Path) -> Path:
 
 
 def _folder(kind: str) -> Path:
-    return platformdirs.user_cache_path("hilsplat") / kind
+    folder = platformdirs.user_cache_path("hilsplat")  # "~/.cache/hilsplat" for a user without a home
+    return (folder if folder.is_absolute() else _private_folder(tempfile.gettempdir())) / kind
+
+
+@functools.cache
+def _private_folder(temporary: str) -> Path:
+    """Return a folder among the temporary files that only this user can write."""
+    folder = Path(temporary) / f"hilsplat-{os.getuid()}"
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    stat = folder.lstat()
+    is_ours = stat.st_uid == os.getuid() and not stat.st_mode & 0o022  # a link has all permissions
+    return folder if is_ours else Path(tempfile.mkdtemp(prefix="hilsplat-"))

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hilsplat.base.artifacts import is_artifact, read_memo, write_json
@@ -34,6 +34,9 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
     """
     replaceable = {*_recorded_outputs(outputs[0], stage), *interrupted_outputs(outputs[0])}
     sources, paths = [Path(path).resolve() for path in inputs], [out.resolve() for out in outputs]
+    occupied = {"working": Path.cwd()}
+    with suppress(RuntimeError):  # a user without a home
+        occupied["home"] = Path.home()
     for out, path in zip(outputs, paths, strict=True):
         require_outside_artifacts(out)
         if sum(other.is_relative_to(path) for other in paths) > 1:
@@ -42,7 +45,7 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
             if source.is_relative_to(path):
                 what = "is an input" if path == source else f"contains the input {source}"
                 raise ArtifactError(f"output {out} {what} of {stage}", fix="choose another output")
-        for name, folder in (("working", Path.cwd()), ("home", Path.home())):
+        for name, folder in occupied.items():
             if folder.resolve().is_relative_to(path):
                 raise ArtifactError(
                     f"output {out} is or contains the {name} folder", fix="choose a new file or folder"

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -102,9 +103,31 @@ def test_machine_code_of_other_versions_is_deleted_once_unused(package, monkeypa
     assert left == {own.name, "kernels-fedcba9876543210", "kernels-mine"}
 
 
-def test_machine_code_of_a_read_only_package_is_in_the_users_cache(package, monkeypatch, tmp_path):
-    monkeypatch.setattr(os, "access", lambda path, mode: False)
+@pytest.fixture
+def read_only(package, monkeypatch) -> Path:
+    """A package that cannot be written."""
+    monkeypatch.setattr(os, "access", lambda path, mode: not Path(path).is_relative_to(package))
+    return package
+
+
+def test_machine_code_of_a_read_only_package_is_in_the_users_cache(read_only, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    assert folder_of(monkeypatch, package).parent == tmp_path / "cache/cpusplat"
+    assert folder_of(monkeypatch, read_only).parent == tmp_path / "cache/cpusplat"
     monkeypatch.setattr(module.config, "CACHE_DIR", str(tmp_path / "chosen"))
-    assert folder_of(monkeypatch, package).parent == tmp_path / "chosen"
+    assert folder_of(monkeypatch, read_only).parent == tmp_path / "chosen"
+
+
+@pytest.mark.parametrize("cache", ["/proc/none", None], ids=["read-only home", "no home"])
+def test_machine_code_is_in_a_private_temporary_folder_if_nothing_else_can_be_written(
+    read_only, monkeypatch, tmp_path, cache
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as for a user without a name
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    if cache:
+        monkeypatch.setenv("XDG_CACHE_HOME", cache)
+    folder = folder_of(monkeypatch, read_only)
+    assert folder.parent == tmp_path / f"cpusplat-{os.getuid()}" == folder_of(monkeypatch, read_only).parent
+    assert folder.is_dir() and folder.parent.stat().st_mode & 0o777 == 0o700
+    folder.parent.chmod(0o777)  # another user may have written machine code to it
+    assert folder_of(monkeypatch, read_only).parent not in (folder.parent, read_only)

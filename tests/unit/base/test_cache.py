@@ -3,17 +3,19 @@
 import os
 import re
 import shutil
+import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from hilsplat.base.artifacts import read_npz, write_arrays
 from hilsplat.base.atomic import atomic_path
-from hilsplat.base.cache import CACHES, ViewCache, prune_cache, size_table
+from hilsplat.base.cache import CACHES, ViewCache, prune_cache, remembered, size_table
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.processes import host_token
@@ -212,3 +214,14 @@ def test_an_entry_that_another_node_prunes_is_still_read(tmp_path: Path, monkeyp
 
     monkeypatch.setattr("hilsplat.base.cache.read_npz", read_and_prune)
     assert cache.get(key, dict)["x"].tolist() == [0, 1, 2]
+
+
+def test_a_user_without_a_home_has_a_cache_among_the_temporary_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda *name: Path("~/.cache", *name))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    examine = Mock(return_value="fast")
+    assert [remembered("speed", "key", examine) for _ in range(2)] == ["fast", "fast"]
+    examine.assert_called_once()
+    assert [path.name for path in tmp_path.iterdir()] == ["temporary"]

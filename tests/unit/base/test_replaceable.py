@@ -122,6 +122,8 @@ def test_the_working_and_the_home_folder_are_never_outputs(tmp_path, monkeypatch
     for out, name in ((Path(), "working"), (tmp_path.parent, "working"), (Path.home(), "home")):
         with pytest.raises(ArtifactError, match=f"is or contains the {name} folder"):
             ownership.require_replaceable([out], "masks", [])
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as for a user without a name and a home
+    ownership.require_replaceable([tmp_path / "new"], "masks", [])
 
 
 def test_an_input_that_changes_during_a_stage_leaves_no_provenance(tmp_path, photographs):
