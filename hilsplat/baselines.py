@@ -4,15 +4,14 @@ A run reads this before it imports the code of any baseline, which takes seconds
 packages add methods with entry points of the group `hilsplat.methods` (docs/extending.md).
 """
 
-import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
 from hilsplat.base.errors import SettingsError
+from hilsplat.base.plugins import Plugins, entry_points
 from hilsplat.settings import HierarchyLosses, Section, Size, knob
 
 OURS = "hilsplat"  # the method of this repository; the `field` stage computes its field
@@ -124,17 +123,17 @@ BASELINES = {
 }
 
 
-@functools.cache
-def installed() -> dict[str, EntryPoint]:
-    """Return the methods of installed packages by name; a baseline of ours keeps its name."""
-    return {point.name: point for point in entry_points(group=GROUP) if point.name not in (OURS, *BASELINES)}
+def installed() -> Plugins[Method]:
+    """Return the methods of installed packages by name."""
+    return entry_points(GROUP, Method, (OURS, *BASELINES))
 
 
 def method_of(name: str) -> Method:
     """Return a baseline, without importing its code.
 
     Raises:
-        SettingsError: there is no such baseline, or the package that has it cannot be imported.
+        SettingsError: there is no such baseline.
+        HilsplatError: the package that has it cannot be imported.
     """
     if name in BASELINES:
         return BASELINES[name]
@@ -150,18 +149,7 @@ def method_of(name: str) -> Method:
             expected=f"one of {', '.join((OURS, *BASELINES, *installed()))}",
             fix="correct the name, or implement the method (docs/extending.md)",
         )
-    point = installed()[name]
-    try:
-        method = point.load()
-    except Exception as error:  # a broken package can raise anything
-        raise SettingsError(f"method {name}: {point.value} cannot be imported: {error}") from error
-    if not isinstance(method, Method):
-        raise SettingsError(
-            f"method {name}: {point.value} is not a method",
-            expected="a hilsplat.baselines.Method (docs/extending.md)",
-            found=type(method).__name__,
-        )
-    return method
+    return installed()[name]
 
 
 def settings_class(section: Any) -> type[MethodSettings]:

@@ -60,7 +60,9 @@ class CoreSettings(Section):
         return self.model_copy(update={"masks": masks, "clip": clip})
 
 
-_PLUGIN_SECTIONS: dict[str, type[Section]] = dict(entry_points("hilsplat.settings"))
+_PLUGIN_SECTIONS: dict[str, type[Section]] = dict(
+    entry_points("hilsplat.settings", Section, tuple(CoreSettings.__annotations__))
+)
 
 if TYPE_CHECKING:
     StageSettings = CoreSettings
@@ -239,6 +241,9 @@ class RunSettings(StageSettings):
                     below = {}  # settings of a different method
                 sections[section] = validated(section, below | values, f"{where}.{section}")
         return StageSettings.model_validate(sections)
+
+
+entry_points("hilsplat.settings", Section, tuple(RunSettings.__annotations__))  # refuses these names as well
 
 
 def seed_parts(name: str) -> tuple[str, int]:

@@ -19,7 +19,7 @@ import typer
 from hilsplat import settings as of
 from hilsplat.base.artifacts import provenance_path
 from hilsplat.base.errors import HilsplatError
-from hilsplat.base.plugins import entry_points
+from hilsplat.base.plugins import entry_points, name_clash
 from hilsplat.baselines import OURS, MethodSettings, method_of
 from hilsplat.datasets.registry import DATASETS, readers_of
 from hilsplat.models.store import AUTO
@@ -678,8 +678,13 @@ def family_of(stage: Stage[..., Any]) -> str:
 @cache
 def all_stages() -> dict[str, Stage[..., Any]]:
     """Return the stages of plugins and of this module, by name."""
-    plugins = [registry.stages for registry in entry_points("hilsplat.stages").values()]
-    return {name: stage for stages in (*plugins, PIPELINE.stages) for name, stage in stages.items()}
+    found, packages = dict[str, Stage[..., Any]](), dict.fromkeys(PIPELINE.stages, "hilsplat")
+    for plugin, registry in entry_points("hilsplat.stages", Registry).items():
+        for name, stage in registry.stages.items():
+            if packages.setdefault(name, plugin) != plugin:
+                raise name_clash("hilsplat.stages", name, packages[name], plugin)
+            found[name] = stage
+    return found | PIPELINE.stages
 
 
 def stage_of(name: str) -> Stage[..., Any]:

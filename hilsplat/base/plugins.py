@@ -6,6 +6,8 @@ from functools import cache
 from importlib import metadata
 from typing import Any, Generic, TypeVar
 
+from hilsplat.base.errors import HilsplatError, first_line, system_error
+
 Part = TypeVar("Part")
 
 
@@ -17,17 +19,32 @@ def load(reference: str) -> Any:
 
 
 class Plugins(Mapping[str, Part], Generic[Part]):
-    """Components by name, imported on first access.
+    """Components by name, imported on first access; HilsplatError if one is broken or is not of `kind`.
 
     The digest of code (`base.code`) does not follow the entries. A stage that uses one component depends only
     on that one, and adds the component's import path in `places` to the roots of its digest.
     """
 
-    def __init__(self, places: Mapping[str, str]) -> None:
-        self.places = dict(places)
+    def __init__(self, group: str, places: Mapping[str, str], kind: type = object) -> None:
+        self.places, self._group, self._kind = dict(places), group, kind
 
     def __getitem__(self, name: str) -> Part:
-        return load(self.places[name])
+        place = self.places[name]
+        what, fix = f"{self._group}: {name} = {place}", "correct or uninstall the package that offers it"
+        try:
+            part: Part = load(place)
+        except Exception as error:  # a broken package can raise anything
+            is_reported = system_error(error) is not None and not isinstance(error, OSError)
+            if is_reported:  # such as too little memory
+                raise
+            raise HilsplatError(f"{what} cannot be imported: {first_line(error)}", fix=fix) from error
+        is_subclass = isinstance(part, type) and issubclass(part, self._kind)
+        if not (is_subclass or isinstance(part, self._kind)):
+            expected = f"{self._kind.__module__}.{self._kind.__name__} (docs/extending.md)"
+            raise HilsplatError(
+                f"{what} has the wrong type", expected=expected, found=type(part).__name__, fix=fix
+            )
+        return part
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.places)
@@ -43,6 +60,30 @@ _all_entry_points = cache(metadata.entry_points)  # it reads files of every inst
 
 
 @cache
-def entry_points(group: str) -> Plugins[Any]:
-    """Return the components that installed packages offer as Python entry points of a group, by name."""
-    return Plugins({point.name: point.value for point in _all_entry_points().select(group=group)})
+def entry_points(group: str, kind: type = object, taken: tuple[str, ...] = ()) -> Plugins[Any]:
+    """Return the components that installed packages offer as Python entry points of a group, by name.
+
+    Args:
+        kind: class of the components, or of which they are subclasses.
+        taken: names of built-in components.
+
+    Raises:
+        HilsplatError: two packages offer the same name, or one offers a name that is taken.
+    """
+    found = dict[str, metadata.EntryPoint]()
+    for point in _all_entry_points().select(group=group):
+        if point.name in taken or point.name in found:
+            raise name_clash(group, point.name, *map(_package_of, (point, found.get(point.name))))
+        found[point.name] = point
+    return Plugins(group, {name: point.value for name, point in found.items()}, kind)
+
+
+def name_clash(group: str, name: str, *packages: str) -> HilsplatError:
+    return HilsplatError(
+        f"{group}: {name!r} is a name in both {' and '.join(packages)}",
+        fix="rename it in one of the packages, or uninstall one",
+    )
+
+
+def _package_of(point: metadata.EntryPoint | None) -> str:
+    return point.dist.name if point and point.dist else "hilsplat"

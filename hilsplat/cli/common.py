@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilsplat.base.errors import ArtifactError, SettingsError, visible
+from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError, visible
 from hilsplat.base.progress import LOG_FORMAT, LogFormatter
 
 PANELS = {
@@ -40,7 +40,11 @@ app.add_typer(blocks_app, name="blocks")
 
 
 def sort_into_panels() -> None:
-    """Sort the commands and groups of `app` into the panels of its help."""
+    """Sort the commands and groups of `app` into the panels of its help.
+
+    Raises:
+        HilsplatError: a plugin adds a command of the same name as another.
+    """
     panels = {name: panel for panel, names in PANELS.items() for name in names}
     every: list[Any] = [app.registered_commands, app.registered_groups]
     for infos in every:
@@ -48,6 +52,15 @@ def sort_into_panels() -> None:
             info.name = info.name or info.callback.__name__
             info.rich_help_panel = panels.get(info.name, STAGES)
         infos.sort(key=lambda info: [*panels, info.name].index(info.name))
+    for group in (app, *filter(None, (info.typer_instance for info in app.registered_groups))):
+        named: list[Any] = [*group.registered_commands, *group.registered_groups]
+        names = [info.name or info.callback.__name__ for info in named]
+        if repeated := sorted({name for name in names if names.count(name) > 1}):
+            raise HilsplatError(
+                f"several commands are named {repeated[0]!r}",
+                fix="rename it in the package that offers it (hilsplat.commands or hilsplat.stages), or "
+                "uninstall the package",
+            )
 
 
 Results = Annotated[Path, typer.Option(help="results folder")]

@@ -9,6 +9,8 @@ import os
 import signal
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -48,32 +50,45 @@ from hilsplat.base.errors import (  # noqa: E402
     system_error,
 )
 from hilsplat.base.processes import end_with_workflow, keep_freed_memory  # noqa: E402
-from hilsplat.cli import group_commands, scene_commands, stage_commands, user_commands  # noqa: E402, F401
 from hilsplat.cli.common import app, echo, sort_into_panels, start_logging  # noqa: E402
 
-sort_into_panels()
-if _interrupt is signal.default_int_handler:
-    signal.signal(signal.SIGINT, _interrupt)
 
-
-def main() -> None:
-    """Run the command; for errors that the user can fix, print a message without a traceback."""
-    end_with_workflow()
-    keep_freed_memory()
+@contextmanager
+def _reported() -> Iterator[None]:
+    """Exit if the block fails; for errors that the user can fix, print a message without a traceback."""
     try:
-        require_working_directory()
-        start_logging()
-        use_writable_cache()
-        app()
-        sys.stdout.flush()
+        yield
     except Exception as error:
         if is_interruption(error):
             sys.exit(130)
         message = system_error(error)
         if message is None and sys.gettrace() is not None:  # for post-mortem debugging
             raise
+        if not logging.getLogger().handlers:  # the commands could not be imported
+            start_logging()
         logging.getLogger("hilsplat").error("%s", message or "unexpected error", exc_info=message is None)
         sys.exit(1)
+
+
+with _reported():  # plugins may be broken
+    from hilsplat.cli import group_commands, scene_commands, stage_commands, user_commands  # noqa: F401
+
+    sort_into_panels()
+if _interrupt is signal.default_int_handler:
+    signal.signal(signal.SIGINT, _interrupt)
+
+
+def main() -> None:
+    """Run the command."""
+    end_with_workflow()
+    keep_freed_memory()
+    try:
+        with _reported():
+            require_working_directory()
+            start_logging()
+            use_writable_cache()
+            app()
+            sys.stdout.flush()
     finally:  # otherwise, garbage-collecting numba and matplotlib objects at exit takes 0.4 s
         gc.freeze()
 

@@ -74,7 +74,7 @@ def _json_of(name: str, text: str, hint: Any) -> Any:
         raise SettingsError(problem, found=text[:80]) from error
 
 
-for _name, _group in entry_points("hilsplat.commands").items():
+for _name, _group in entry_points("hilsplat.commands", typer.Typer).items():
     app.add_typer(_group, name=_name)
     GROUPS[_name] = _group
 for _stage in all_stages().values():

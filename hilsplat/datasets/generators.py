@@ -15,8 +15,6 @@ from hilsplat.datasets.points.labelled_points import LabelledPoints
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.sheet import Generated, generated_of
 
-GENERATORS: Plugins["Generator"] = entry_points("hilsplat.generators")
-
 
 @dataclass(frozen=True)
 class Truth:
@@ -60,6 +58,9 @@ class Generator:
     size: Callable[[Any], tuple[int, float]]
     open: Callable[[Path, str], Truth]
     pictures: tuple[str, ...] = ()
+
+
+GENERATORS: Plugins[Generator] = entry_points("hilsplat.generators", Generator)
 
 
 def generator_of(source: str) -> tuple[Generator, Generated]:

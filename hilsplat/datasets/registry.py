@@ -16,20 +16,21 @@ if TYPE_CHECKING:  # imports OpenCV and SciPy, which workflow start-up and table
     from hilsplat.datasets.labelled import LabelledScene
     from hilsplat.datasets.points.labelled_points import PointScene
 
+_OURS = {
+    "lerf_ovs": "hilsplat.datasets.images.lerf_ovs:DATASET",
+    "lerf_mask": "hilsplat.datasets.images.lerf_mask:DATASET",
+    "3d_ovs": "hilsplat.datasets.images.ovs3d:DATASET",
+    "hi_lerf": "hilsplat.datasets.images.hi:HI_LERF",
+    "hi_3dovs": "hilsplat.datasets.images.hi:HI_3DOVS",
+    "annotated": "hilsplat.datasets.images.hi:ANNOTATED",
+    "scannet": "hilsplat.datasets.points.scannet:DATASET",
+    "scannet200": "hilsplat.datasets.points.scannet:SCANNET200_DATASET",
+    "replica": "hilsplat.datasets.points.replica:DATASET",
+    "waymo": "hilsplat.datasets.waymo.reader:DATASET",
+}
+_GROUP, _TAKEN = "hilsplat.datasets", (*_OURS, *entry_points("hilsplat.generators"))
 DATASETS: Plugins[Dataset] = Plugins(
-    {
-        "lerf_ovs": "hilsplat.datasets.images.lerf_ovs:DATASET",
-        "lerf_mask": "hilsplat.datasets.images.lerf_mask:DATASET",
-        "3d_ovs": "hilsplat.datasets.images.ovs3d:DATASET",
-        "hi_lerf": "hilsplat.datasets.images.hi:HI_LERF",
-        "hi_3dovs": "hilsplat.datasets.images.hi:HI_3DOVS",
-        "annotated": "hilsplat.datasets.images.hi:ANNOTATED",
-        "scannet": "hilsplat.datasets.points.scannet:DATASET",
-        "scannet200": "hilsplat.datasets.points.scannet:SCANNET200_DATASET",
-        "replica": "hilsplat.datasets.points.replica:DATASET",
-        "waymo": "hilsplat.datasets.waymo.reader:DATASET",
-        **entry_points("hilsplat.datasets").places,
-    }
+    _GROUP, {**_OURS, **entry_points(_GROUP, Dataset, _TAKEN).places}, Dataset
 )
 """Supported data sets in the order of the paper's tables."""
 

@@ -1,6 +1,7 @@
 """Commands in an unusable environment: full output, shell limits, a deleted working directory."""
 
 import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -75,3 +76,39 @@ def test_an_image_that_the_machine_cannot_read_is_not_called_damaged(tmp_path: P
 def test_more_threads_than_cores_cost_nothing(project: Path):
     script = f"{sys.executable} -m hilsplat {QUERY} --threads 100000"
     assert subprocess.run(script, shell=True, cwd=project, timeout=60, check=True).returncode == 0
+
+
+REGISTRY = """
+from hilsplat.stage import PathOut, Registry
+PIPELINE = Registry()
+@PIPELINE.stage()
+def masks(out: PathOut) -> None: ...
+"""
+SECTION = "from hilsplat.settings import Section\nclass NAME(Section): ..."
+
+
+@pytest.mark.parametrize(
+    ("group", "point", "code", "words"),
+    [
+        ("stages", "x = mine:NAME", "import no_such", "x = mine:NAME cannot be imported: No module named"),
+        ("settings", "x = mine:NAME", "", "x = mine:NAME cannot be imported: module 'mine' has no"),
+        ("commands", "x = mine:NAME", "NAME = 1", "x = mine:NAME has the wrong type"),
+        ("settings", "masks = mine:NAME", "", "'masks' is a name in both mine and hilsplat"),
+        ("settings", "results = mine:NAME", SECTION, "'results' is a name in both mine and hilsplat"),
+        ("datasets", "replica = mine:NAME", "", "'replica' is a name in both mine and hilsplat"),
+        ("methods", "saga = mine:NAME", "", "'saga' is a name in both mine and hilsplat"),
+        ("generators", "world = mine:NAME", "", "'world' is a name in both"),  # packages, in either order
+        ("stages", "x = mine:PIPELINE", REGISTRY, "'masks' is a name in both hilsplat and x"),
+        ("commands", "query = mine:NAME", "import typer\nNAME = typer.Typer()", "commands are named 'query'"),
+    ],
+)
+def test_a_broken_plugin_and_one_that_takes_a_name_are_named(tmp_path: Path, group, point, code, words):
+    (tmp_path / "mine.py").write_text(code)
+    (tmp_path / "mine-1.0.dist-info").mkdir()
+    (tmp_path / "mine-1.0.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (tmp_path / "mine-1.0.dist-info/entry_points.txt").write_text(f"[hilsplat.{group}]\n{point}\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ["PYTHONPATH"]])}
+    command = [sys.executable, "-m", "hilsplat", "settings"]
+    ended = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
+    assert ended.returncode == 1 and "Traceback" not in ended.stderr
+    assert words in ended.stderr and f"hilsplat.{group}" in ended.stderr

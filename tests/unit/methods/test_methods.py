@@ -10,6 +10,7 @@ import tomllib
 import types
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib import metadata
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ import torch
 import yaml
 
 from hilsplat import baselines
-from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base import plugins
+from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.plugins import load
 from hilsplat.baselines import BASELINES, OURS, MethodSettings, method_of, own_settings
@@ -189,9 +191,10 @@ def nearest_mask(tmp_path, monkeypatch):
     text = "\n".join([f"[{baselines.GROUP}]", *lines, ""])
     (tmp_path / "nearest_mask-1.0.dist-info/entry_points.txt").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
-    baselines.installed.cache_clear()
+    monkeypatch.setattr(plugins, "_all_entry_points", metadata.entry_points)
+    plugins.entry_points.cache_clear()
     yield tmp_path
-    baselines.installed.cache_clear()
+    plugins.entry_points.cache_clear()
     sys.modules.pop("nearest_mask", None)
 
 
@@ -222,12 +225,12 @@ def test_the_package_in_the_documentation_adds_a_method_with_two_settings(inputs
     [
         ("import no_such_module", "cannot be imported: No module named"),
         ("METHOD = 1 / 0", "cannot be imported: division by zero"),
-        ("METHOD = 1", "is not a method"),
+        ("METHOD = 1", "has the wrong type"),
     ],
 )
 def test_a_broken_package_is_reported(nearest_mask, code, problem):
     (nearest_mask / "nearest_mask/__init__.py").write_text(code)
-    with pytest.raises(SettingsError, match=f"method nearest_mask: nearest_mask:METHOD {problem}"):
+    with pytest.raises(HilsplatError, match=f"methods: nearest_mask = nearest_mask:METHOD {problem}"):
         parse_section("method", '{"name": "nearest_mask"}')
 
 
