@@ -91,7 +91,7 @@ rule stage:
         str(INSTALLED / "workflow/envs/hilsplat.yaml")
     threads: RESOURCES.threads
     shell:
-        "python -m hilsplat --log {log:q} {params.command} --threads {threads}"
+        "python -P -m hilsplat --log {log:q} {params.command} --threads {threads}"
         " --memory {resources.mem_mib} --out {output.out:q}"
 
 

@@ -64,7 +64,6 @@ def prepare_process() -> TextIOWrapper | None:
     end_with_workflow()  # `hilsplat run` may have started this process
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
     os.environ |= parent_variable()
-    os.environ["PYTHONSAFEPATH"] = "1"  # jobs must not import modules from the working folder
     if os.environ.get(UNREGISTERED):
         return None
     with suppress(OSError):

@@ -29,5 +29,5 @@ rule train_models:
             Path(output[0]).parents[1] / ".cache/models"
         ),
     shell:
-        "PYTHONPATH={params.checkout:q} python -m models.training --out {params.out:q} --cache {params.cache:q}"
+        "PYTHONPATH={params.checkout:q} python -P -m models.training --out {params.out:q} --cache {params.cache:q}"
         " --seed {params.seed:q} --threads {threads} > {log:q} 2>&1"

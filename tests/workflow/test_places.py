@@ -87,7 +87,7 @@ rule mine:
 """
     )
     printed = plan_of(clone, outer, "-p")
-    commands = [line for line in printed.splitlines() if "python -m hilsplat" in line]
+    commands = [line for line in printed.splitlines() if "python -P -m hilsplat" in line]
     assert len(commands) >= 10 and "rule hilsplat_evaluate:" in printed
     paths = [word for line in commands for word in line.split() if "results" in word]
     assert [path for path in paths if not path.startswith("inner/results/")] == []
@@ -103,8 +103,34 @@ rule mine:
         assert made == (finished.root / "results" / path).read_bytes(), path
 
 
+def test_a_script_of_a_workflow_with_our_module_imports_from_its_folder(
+    plain: Project, tmp_path: Path
+) -> None:
+    (tmp_path / "scripts").mkdir()
+    (tmp_path / "scripts/mine.py").write_text("import beside")
+    (tmp_path / "scripts/beside.py").write_text("print('imported')")
+    (tmp_path / "Snakefile").write_text(
+        f"""
+configfile: {str(plain.root / "config/ci.yaml")!r}
+
+module hilsplat:
+    snakefile: {str(plain.root / "Snakefile")!r}
+    config: config
+
+use rule * from hilsplat as hilsplat_*
+
+rule mine:
+    output: "mine.txt"
+    shell: "python scripts/mine.py > {{output}}"
+"""
+    )
+    command = (sys.executable, "-m", "snakemake", "--cores", "1", "mine")
+    Project(tmp_path).run(*command, PYTHONPATH=str(plain.root))
+    assert (tmp_path / "mine.txt").read_text() == "imported\n"
+
+
 def test_the_results_folder_is_one_setting(clone: Project) -> None:
     printed = clone.snakemake("-n", "-p", "--verbose", "--config", "results=out put").stdout
     assert "output: out put/" in printed and "output: results/" not in printed
-    commands = [line for line in printed.splitlines() if "python -m hilsplat" in line]
+    commands = [line for line in printed.splitlines() if "python -P -m hilsplat" in line]
     assert not [line for line in commands if " results/" in line]
