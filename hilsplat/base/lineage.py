@@ -25,7 +25,7 @@ from hilsplat.base.artifacts import (
     write_json,
 )
 from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, foreign
-from hilsplat.base.files import files_below, regular
+from hilsplat.base.files import INSTALLED, files_below, regular
 
 CONVERTED = ".made_from.json"
 """Hidden file in a folder of extracted frames or unpacked photographs that records their source."""
@@ -335,12 +335,13 @@ def version_of(distribution: str) -> str | None:
 
 @functools.cache
 def git_commit() -> str:
-    """Return the checkout's commit, with "+edits" if files were changed, or "unknown" outside a checkout."""
-    folder = Path(__file__).resolve().parent
+    """Return our checkout's commit, with "+edits" if files were changed, or "unknown" if we are installed."""
+    if not (INSTALLED / ".git").exists():  # a folder above may be a repository of the user
+        return "unknown"
 
     def git(*words: str) -> str:
         return subprocess.run(
-            ["git", *words], cwd=folder, capture_output=True, text=True, check=True, timeout=20
+            ["git", *words], cwd=INSTALLED, capture_output=True, text=True, check=True, timeout=20
         ).stdout.strip()
 
     try:

@@ -1,6 +1,9 @@
 """Digests follow content; artifacts of different sources are refused."""
 
 import errno
+import os
+import subprocess
+import sys
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -16,12 +19,30 @@ from hilsplat.base.lineage import (
     sha256_of_path,
     visible_files,
 )
+from tests.conftest import PROJECT
 from tests.unit.artifact_changes import write_record
 
 
 def test_digest_of_parts_depends_on_their_boundaries() -> None:
     assert sha256_of_bytes(b"ab", b"c") != sha256_of_bytes(b"a", b"bc")
     assert sha256_of_json({"a": 1, "b": 2}) == sha256_of_json({"b": 2, "a": 1})
+
+
+@pytest.mark.parametrize("place", [".", "venv/site-packages"])
+def test_only_a_commit_of_our_own_checkout_is_recorded(tmp_path: Path, place: str) -> None:
+    for part in ("__init__.py", "base/*.py"):
+        for file in (PROJECT / "hilsplat").glob(part):
+            copy = tmp_path / place / file.relative_to(PROJECT)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(file.read_bytes())
+    git = ("git", "-c", "user.name=me", "-c", "user.email=me@example.org", "-C", str(tmp_path))
+    for words in (("init", "-q"), ("add", "."), ("commit", "-q", "-m", "mine")):
+        subprocess.run([*git, *words], check=True)
+    code = "from hilsplat.base.lineage import git_commit; print(git_commit())"
+    how = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": str(tmp_path / place)}, "text": True}
+    printed = subprocess.check_output([sys.executable, "-B", "-c", code], **how).strip()
+    commit = subprocess.check_output([*git, "rev-parse", "HEAD"], text=True).strip()
+    assert printed == (commit if place == "." else "unknown")
 
 
 def test_folder_digest_follows_names_and_bytes(tmp_path: Path) -> None:
