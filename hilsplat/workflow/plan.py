@@ -565,17 +565,8 @@ def _first_kind(kinds: list[Stage[..., Any]], facts: Facts) -> Stage[..., Any]:
 
 def require_variant_sections(run: RunSettings) -> None:
     """Raise SettingsError for a variant that changes a section of the stages that all variants share."""
-    names = {SCORED}
-    artifacts = [SCORED]
-    while artifacts:
-        stages = [stage for stage in kinds_of(artifacts.pop()) if stage.scope == "variant"]
-        inputs = {name for stage in stages for name in stage.inputs} - names
-        names |= inputs
-        artifacts += inputs
-    scored = [
-        stage for stage in all_stages().values() if stage.artifact in names and stage.scope == "variant"
-    ]
-    sections = {section for stage in scored for section in stage.sections.values()}
+    stages = [stage for stage in all_stages().values() if stage.scope == "variant"]
+    sections = {section for stage in stages for section in stage.sections.values()}
     for variant, changed in run.variants.items():
         for section in changed:
             if section not in sections:

@@ -141,8 +141,9 @@ class JobResources:
         """Return the resources of a stage's rule."""
         stage = stage_of(name)
         resources = {"mem_mb": self.memory_mb(name), "runtime": self.minutes(name)}
-        if any("device" in SECTIONS[section].model_fields for section in stage.sections.values()):
-            resources["gpu"] = self.gpus(family_of(stage))
+        sections = [name for name in stage.sections.values() if "device" in SECTIONS[name].model_fields]
+        if sections:
+            resources["gpu"] = self.gpus(sections[0])
         return resources
 
     def memory_mb(self, rule: str) -> Callable[..., int]:

@@ -12,8 +12,9 @@ import pytest
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.configuration import merged_config, parse_run
 from hilsplat.scene.sheet import read_sheet
-from hilsplat.settings import MasksSettings
-from hilsplat.stages import stage_of
+from hilsplat.settings import MasksSettings, PosesSettings
+from hilsplat.stage import PathOut, Registry
+from hilsplat.stages import all_stages, stage_of
 from hilsplat.workflow import targets
 from hilsplat.workflow.models import models_of_photographs, settings_of_photographs
 from hilsplat.workflow.plan import Plan, any_of, without_scene
@@ -97,6 +98,14 @@ def test_a_configuration_without_scenes_or_with_an_impossible_variant_is_refused
     variants = {**VARIANTS, **config.get("variants", {})}
     with pytest.raises(HilsplatError, match=message):
         plan(tmp_path, main_variants=list(VARIANTS), **{**config, "variants": variants})
+
+
+def test_a_variant_may_change_what_only_a_stage_of_a_plugin_reads(tmp_path, monkeypatch):
+    def report(settings: PosesSettings, out: PathOut) -> None: ...
+
+    monkeypatch.setitem(all_stages(), "report", Registry().stage()(report))
+    found = plan(tmp_path, variants={"x": {"poses": {"mapper": "global"}}}, main_variants=["x"])
+    assert found.run.stages("x").poses.mapper == "global"
 
 
 def test_only_random_variants_are_repeated_per_seed(tmp_path):

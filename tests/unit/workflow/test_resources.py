@@ -12,6 +12,9 @@ import pytest
 from PIL import Image
 
 from hilsplat.scene.layouts import vertex_count
+from hilsplat.settings import ContributionsSettings
+from hilsplat.stage import PathOut, Registry
+from hilsplat.stages import all_stages
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.resources import COSTS, RUNNER_MB, JobResources, Size
 from tests.conftest import PROJECT
@@ -130,6 +133,14 @@ def test_jobs_that_use_a_card_request_one(
     config["masks"]["segmenter"] = segmenter
     found = JobResources(plan(tmp_path, **config), cores)
     assert [found.gpus(section)(JOB) for section in sections] == expected
+
+
+def test_a_stage_of_a_plugin_that_reads_settings_with_a_device_requests_a_card(tmp_path, monkeypatch):
+    def count(settings: ContributionsSettings, out: PathOut) -> None: ...
+
+    monkeypatch.setitem(all_stages(), "count", Registry().stage()(count))
+    resources = JobResources(plan(tmp_path, contributions={"device": "cuda"}), None).of("count")
+    assert resources["gpu"](JOB) == 1
 
 
 def test_the_size_of_a_scene_is_that_of_its_settings_until_its_cameras_can_be_read(tmp_path, monkeypatch):
