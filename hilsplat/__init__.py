@@ -108,6 +108,9 @@ class _CallablePackage(ModuleType):
     def __wrapped__(self) -> Any:
         return __getattr__(self.__name__.rpartition(".")[2])
 
+    def __reduce__(self) -> tuple[Any, ...]:  # as a function, it is sent to other processes by name
+        return __getattr__, (self.__name__.rpartition(".")[2],)
+
 
 class _Root(ModuleType):
     """This package, in which an import of the subpackage `segment` doesn't hide the function `segment`."""

@@ -20,7 +20,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import hilsplat
-from hilsplat import stages
+from hilsplat import library, stages
 from hilsplat.base.errors import ArtifactError, HilsplatError, ModelError, SceneError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.base.lineage import read_provenance, sha256_of_path
@@ -420,6 +420,10 @@ def test_a_scene_can_be_sent_to_another_process_without_its_cache(desk):
     assert found == hits and sent.like_picture(sent.views.image("000.png"))
     np.testing.assert_array_equal(found[0].mask("000.png"), mask)
     assert len(pickle.dumps(scene)) < 1.1 * size
+
+
+def test_a_function_can_be_sent_to_another_process():
+    assert pickle.loads(pickle.dumps(hilsplat.segment)) is library.segment
 
 
 def test_levels_are_found_by_number_and_label(desk, masks, linked):
