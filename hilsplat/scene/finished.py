@@ -159,11 +159,14 @@ def refining(folder: Path) -> str:
 
 
 def is_drawn(scene: Path) -> bool:
-    """Return whether a `Scene` artifact was made from a generator's renders (from its provenance)."""
+    """Return whether a `Scene` artifact was made from a generator's renders, which have a record, too."""
     record = read_provenance(scene)
     images = record.inputs.get("images") if record else None
     folder = Path(images.path) if images else Path()
-    return folder.name == "images" and folder.parent.name in entry_points("hilsplat.generators")
+    if folder.name != "images" or folder.parent.name not in entry_points("hilsplat.generators"):
+        return False
+    beside = scene.parent / folder.parent.name / folder.name  # where they are if the results were moved
+    return any(provenance_path(path).is_file() for path in (folder, beside))
 
 
 def finished_variants(folder: Path) -> list[str]:

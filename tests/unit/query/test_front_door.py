@@ -121,9 +121,13 @@ def test_the_embedded_clip_warns_that_it_does_not_know_photographs(copied, caplo
     named = replace(scene, names=NodeNames({0: "the frog"}))
     assert named.caution_about("The frog") == "" and named.caution_about("the frog > nose") == caution
     # the embedded models were trained on synthetic scenes
-    for images, expected in ((str(copied / "scene"), caution), ("results/synthetic/x/world/images", "")):
+    for images in (str(copied / "scene"), "photographs/of/the/world/images"):
         write_record(copied / "scene", inputs={"images": {"path": images}})
-        assert hilsplat.open_scene(copied).caution == expected
+        assert hilsplat.open_scene(copied).caution == caution
+    write_record(copied / "scene", inputs={"images": {"path": "results/synthetic/x/world/images"}})
+    (copied / "world").mkdir()
+    write_record(copied / "world/images")
+    assert hilsplat.open_scene(copied).caution == ""
 
 
 def test_the_example_of_the_docs_runs(named_desk, project, monkeypatch, capsys):
