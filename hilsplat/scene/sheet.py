@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hilsplat.base.errors import SceneError, nearest
-from hilsplat.base.files import IMAGE_SUFFIXES, NAME_RULE, list_images, name_problem, regular
+from hilsplat.base.files import IMAGE_SUFFIXES, INSTALLED, NAME_RULE, list_images, name_problem, regular
 from hilsplat.base.plugins import entry_points
 from hilsplat.scene.layouts import NO_POSES, contents, has_known_poses, photo_folder
 
@@ -146,6 +146,17 @@ def row_of_data(name: str, data_root: str) -> SceneRow:
     dataset, _, scene = name.partition("/")
     folder = Path(data_root).expanduser() / name
     return SceneRow(dataset, scene, dataset, f"{DATA_PREFIX}{name}", "metre", folder)
+
+
+def with_installed(rows: Sequence[SceneRow], only: Iterable[str], data_root: str) -> list[SceneRow]:
+    """Return the rows, and rows of the installed sheet for names in `only` that match none of them.
+
+    Installed configurations name these scenes; the sheet that `hilsplat new` starts doesn't have them.
+    """
+    missing = [name for name, matches in matches_of(rows, only).items() if not matches]
+    installed = read_sheet(INSTALLED / DEFAULT_SHEET, (), data_root) if missing else []
+    more = {row.name: row for matches in matches_of(installed, missing).values() for row in matches}
+    return [*rows, *more.values()]
 
 
 def choose_scenes(

@@ -24,6 +24,7 @@ from hilsplat.scene.sheet import (
     choose_scenes,
     read_sheet,
     row_of_data,
+    with_installed,
 )
 from hilsplat.settings import MasksSettings
 from hilsplat.stage import Facts, Stage
@@ -117,7 +118,7 @@ class Plan:
             )
         require_variant_sections(run)
         sheet = project_path(run.scenes)
-        rows = read_sheet(sheet, run.groups, run.data_root)
+        rows = with_installed(read_sheet(sheet, run.groups, run.data_root), run.only, run.data_root)
         names_of_data = unlisted({row.source for row in rows}, run.groups, run.data_root)
         self.rows = (*rows, *(row_of_data(name, run.data_root) for name in names_of_data))
         self.ignored = without_scene(run, [*self.rows, *read_sheet(INSTALLED / DEFAULT_SHEET, ())])

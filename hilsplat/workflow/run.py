@@ -30,7 +30,7 @@ from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.base.processes import end_with_workflow, lock, parent_variable, remove_leftovers
 from hilsplat.base.removal import delete
 from hilsplat.configuration import CONFIG, SECTIONS, first_unusable, merged_config, parse_run, read_config
-from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, is_pattern, matches_of, read_sheet
+from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, is_pattern, matches_of, read_sheet, with_installed
 from hilsplat.workflow.estimate import forecasts
 from hilsplat.workflow.plan import Plan, kept_by_variants, without_effect
 from hilsplat.workflow.records import outdated
@@ -176,6 +176,7 @@ def run(
         error.add_line("in", first_unusable(configs))
         raise
     rows = read_sheet(project_path(chosen.scenes), (), chosen.data_root)  # the plan checks the folders
+    rows = with_installed(rows, chosen.only, chosen.data_root)
     files, names = f"{chosen.results}/", {row.name for row in rows}
     targets = [str(Path(target)) for target in targets]  # shells complete folders with a slash
     targets = [name if (name := target.removeprefix(files)) in names else target for target in targets]

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.base.errors import HilsplatError, SceneError, SettingsError
 from hilsplat.configuration import merged_config, parse_run
 from hilsplat.scene.sheet import read_sheet
 from hilsplat.settings import MasksSettings, PosesSettings
@@ -98,6 +98,14 @@ def test_a_configuration_without_scenes_or_with_an_impossible_variant_is_refused
     variants = {**VARIANTS, **config.get("variants", {})}
     with pytest.raises(HilsplatError, match=message):
         plan(tmp_path, main_variants=list(VARIANTS), **{**config, "variants": variants})
+
+
+def test_installed_configurations_find_their_scenes_beside_a_sheet_of_photographs(tmp_path):
+    photographs = ("photos desk photos world:room:9 metre",)
+    found = plan_of(tmp_path, photographs, only=["table-1", "desk"])
+    assert [row.name for row in found.scenes] == ["photos/desk", "synthetic/table-1"]
+    with pytest.raises(SceneError, match=r"no scene is named 'table-77'(.|\n)*photos/desk"):
+        plan_of(tmp_path, photographs, only=["table-77"])
 
 
 def test_a_variant_may_change_what_only_a_stage_of_a_plugin_reads(tmp_path, monkeypatch):

@@ -210,9 +210,8 @@ def test_options_of_the_command_need_no_separator(folder, started, monkeypatch):
 
 def test_a_configuration_is_found_by_its_name(folder, project, started):
     Path("config/config.yaml").unlink()
-    write_sheet(Path("config/scenes.tsv"), ("synthetic table-1 benchmark world:tabletop:1 metre",))
     Path("config/mine.yaml").write_text("seed: 5\n")
-    runs.run([], [Path("demo"), Path("mine")], ["-n"])
+    runs.run(["table-1"], [Path("demo"), Path("mine")], ["-n"])  # a scene of the installed sheet
     configs = started[0][started[0].index("--configfile") + 1 :][:2]
     assert configs == [str(project / "config/demo.yaml"), "config/mine.yaml"]
     with pytest.raises(SettingsError, match=r"no configuration is named 'dem'(.|\n)*did you mean 'demo'"):
