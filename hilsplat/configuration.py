@@ -135,7 +135,7 @@ def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -
     return SettingsError("the settings are not valid:\n  " + "\n  ".join(lines))
 
 
-RESERVED = ("annotations", "benchmarks", "export", "gaussians", "logs", "queries", "scene")
+RESERVED = ("annotations", "benchmarks", "export", "gaussians", "logs", "queries", "scene", "source")
 """Names of files and folders in a scene folder; a variant cannot have such a name."""
 
 SEEDED = re.compile(r"(.+)\.seed([0-9]+)")

@@ -66,7 +66,9 @@ def test_names_that_a_shell_or_a_folder_could_misread_are_refused(where: str, na
         parse_run({where: {name: {}} if where == "variants" else [name]})
 
 
-@pytest.mark.parametrize("name", ["world", "logs", "queries", "export", "scene", "gaussians", "scene.seed1"])
+@pytest.mark.parametrize(
+    "name", ["world", "logs", "queries", "export", "scene", "source", "gaussians", "scene.seed1"]
+)
 def test_a_variant_cannot_have_the_name_of_a_file_in_the_scene_folder(name: str) -> None:
     with pytest.raises(SettingsError, match="is reserved for files"):
         parse_run({"variants": {name: {}}})
