@@ -98,7 +98,7 @@ def reconstruct(
         RegistrationError: too few photographs could be registered.
         ArtifactError: the folder has results of a run.
     """
-    return _posed(Path(photos), NO_POSES, settings, folder, seed, threads, progress)
+    return _posed(_path(photos), NO_POSES, settings, folder, seed, threads, progress)
 
 
 def load_scene(
@@ -124,7 +124,7 @@ def load_scene(
         ArtifactError: the path does not exist; the message lists the scenes of its results folder.
         SceneError: the folder has no poses, or they cannot be used.
     """
-    path = Path(path).absolute()  # files are read later, perhaps from another working folder
+    path = _path(path).absolute()  # files are read later, perhaps from another working folder
     for posed in (path / "scene", path):
         if (posed / INDEX).is_file() and (posed / "cameras.npz").is_file():
             if settings or poses or folder:
@@ -135,7 +135,7 @@ def load_scene(
             return Scene.load(posed)
     if not path.is_file():
         require_scene_folder(path)
-    return _posed(path, Path(poses) if poses else None, settings, folder, seed, threads, progress)
+    return _posed(path, _path(poses) if poses else None, settings, folder, seed, threads, progress)
 
 
 def _posed(
@@ -208,9 +208,9 @@ def load_gaussians(path: Path | str, scene: Scene | None = None) -> Gaussians:
         ArtifactError: the file is missing, or is not a 3DGS PLY.
     """
     if scene is None:
-        return load_ply(Path(path))
+        return load_ply(_path(path))
     require_kind(scene, Scene, OPEN)
-    return import_gaussians(Path(path), scene)[0]
+    return import_gaussians(_path(path), scene)[0]
 
 
 def segment(
@@ -293,7 +293,7 @@ def link(
     if not len(gaussians):
         raise SceneError("there are no Gaussians to link", fix="pass those of hilsplat.fit or load_gaussians")
     _require_own(folder)
-    if folder and scene.folder.resolve() != (Path(folder) / "scene").resolve():
+    if folder and scene.folder.resolve() != (_path(folder) / "scene").resolve():
         raise ArtifactError(
             f"{folder} is not the folder of {scene.name}, whose poses are in {scene.folder}",
             fix="give the same folder to `reconstruct` or `load_scene`, and to `link`",
@@ -321,8 +321,9 @@ def link(
 def _require_own(folder: Path | str | None) -> None:
     """Raise ArtifactError if a folder has Gaussians or variants that `link` did not store."""
     names = ("gaussians.ply", "default") if folder else ()
-    origin = read_memo(Path(folder or "") / "gaussians.json", dict[str, Any]).get("origin")
-    if any((Path(folder or "") / name).exists() for name in names) and origin != {"kind": GIVEN}:
+    base = _path(folder or "")
+    origin = read_memo(base / "gaussians.json", dict[str, Any]).get("origin")
+    if any((base / name).exists() for name in names) and origin != {"kind": GIVEN}:
         raise ArtifactError(
             f"{folder} has results of a run",
             expected="a new folder, or one with results of `hilsplat.link`",
@@ -354,11 +355,16 @@ def _one_blas_thread() -> Iterator[None]:
 _ONE_BLAS_THREAD = Shared(_one_blas_thread)
 
 
+def _path(path: Path | str) -> Path:
+    """Return a path in which a leading `~` is replaced by the home folder."""
+    return Path(path).expanduser()
+
+
 @contextmanager
 def _folder(path: Path | str | None) -> Iterator[Path]:
     """Yield the folder, or a temporary one, which only the process that created it deletes."""
     if path:
-        yield Path(path).absolute()
+        yield _path(path).absolute()
         return
     folder, creator = Path(mkdtemp(prefix="hilsplat-")).absolute(), os.getpid()
     try:

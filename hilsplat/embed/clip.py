@@ -32,6 +32,7 @@ SIGLIP_STATISTICS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 SIGLIP_TOKENS = 64  # text length (tokens) of a SigLIP model whose configuration does not specify it
 NO_PUNCTUATION = str.maketrans("", "", string.punctuation)
 CARD_CROPS, MAX_CROPS = 64, 256  # crops of a card's first call, and maximum of later calls
+MAX_TEXTS = 20_000  # number of texts whose vectors, of 2 to 5 KB, are kept for later queries
 MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # configurations of the models in `models/`
 
 
@@ -221,10 +222,13 @@ class ClipModel:
         """
         if isinstance(texts, str) or not len(texts):
             raise SettingsError(f"{texts!r} is not a list of texts", expected='such as ["mug", "book"]')
+        if len(self._text_vectors) > MAX_TEXTS:
+            self._text_vectors = {}  # a new dictionary, because another thread may read the old one
+        vectors = self._text_vectors
         for text in texts:
-            if text not in self._text_vectors:
-                self._text_vectors[text] = self._embed_text(text)
-        return np.stack([self._text_vectors[text] for text in texts])
+            if text not in vectors:
+                vectors[text] = self._embed_text(text)
+        return np.stack([vectors[text] for text in texts])
 
     def unknown_words(self, text: str) -> list[str]:
         """Return the words of a text that are not in the vocabulary; empty for word-piece tokenizers."""

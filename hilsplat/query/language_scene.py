@@ -41,7 +41,7 @@ logger = logging.getLogger(__name__)
 BEST_VIEWS = 3  # maximum number of best views of an answer
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LanguageScene(NodeQueries):
     """A finished scene that accepts text queries.
 

@@ -121,7 +121,7 @@ class FoundScene:
         return naming
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scenes:
     """The finished scenes of a results folder, which accept text queries together.
 

@@ -32,7 +32,7 @@ class Photo:
     size_hw: tuple[int, int]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """An undistorted pinhole camera (OpenCV axes: x right, y down, z forward).
 
@@ -85,7 +85,7 @@ class Camera:
         return replace(self, K=scale[:, None] * self.K, size_hw=size_hw)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cameras:
     """V posed cameras.
 

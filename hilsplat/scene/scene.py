@@ -12,7 +12,7 @@ from hilsplat.base.images import read_image
 from hilsplat.scene.cameras import Cameras
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A posed scene: the output `scene/` of the `poses` stage, which all later stages read.
 

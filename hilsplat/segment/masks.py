@@ -81,7 +81,7 @@ PER_MASK = ("level", "predicted_iou", "stability", "area_px", "box_xyxy")
 """Fields of `HierarchicalMasks` with one entry per mask."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HierarchicalMasks:
     """M masks of one view; they may overlap, across and within levels."""
 

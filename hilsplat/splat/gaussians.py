@@ -11,7 +11,7 @@ from hilsplat.base.errors import SettingsError
 SH_0 = 0.28209479177387814  # value of the constant harmonic
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Gaussians:
     """N anisotropic 3D Gaussians of one scene, as contiguous arrays.
 

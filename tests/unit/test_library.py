@@ -69,6 +69,8 @@ def test_objects_are_one_line_each_and_cameras_are_found_by_name_and_row(desk, s
     every = (scene, scene.cameras, scene.cameras[0], linked.gaussians, rendering, masks, hit, linked, scores)
     for each in (*every, linked.nodes[0], masks["000.png"]):
         assert "\n" not in repr(each) and len(repr(each)) < 150, repr(each)
+    for each in (linked, scene, scene.cameras, scene.cameras[0], linked.gaussians, masks["000.png"]):
+        assert {each: "found"}[each] == "found" and each != replace(each)
     assert repr(scene) == "Scene(photos/desk: 6 views (1 held out), 0 points)"
     assert [camera.name for camera in scene.cameras] == list(scene.names)
     np.testing.assert_array_equal(scene.cameras[-1].K, scene.cameras["005.png"].K)
@@ -94,7 +96,9 @@ def test_a_fit_equals_that_of_the_stage(scene, tmp_path, monkeypatch, iterations
     assert len(other) != len(found) or not np.array_equal(other.means, found.means)
 
 
-def test_masks_equal_those_of_the_stage_and_the_automatic_segmenter_is_the_graph(scene, tmp_path, temporary):
+def test_masks_equal_those_of_the_stage_and_the_automatic_segmenter_is_the_graph(
+    scene, tmp_path, temporary, monkeypatch
+):
     found = hilsplat.segment(scene, segmenter="graph", graph_scales=(0.3, 0.1, 0.05), threads=2)
     section = MasksSettings(segmenter="graph", graph_scales=(0.3, 0.1, 0.05))
     stages.masks(scene.folder, tmp_path / "masks", section, tmp_path / "cache")
@@ -104,7 +108,8 @@ def test_masks_equal_those_of_the_stage_and_the_automatic_segmenter_is_the_graph
     assert not list(temporary.iterdir())
     # a cache keeps finished views
     kept = tmp_path / "kept"
-    hilsplat.segment(scene, segmenter="graph", cache=kept)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    hilsplat.segment(scene, segmenter="graph", cache="~/kept")
     entries = sha256_of_path(kept)
     hilsplat.segment(scene, segmenter="graph", cache=kept)
     assert sha256_of_path(kept) == entries and len(list(kept.rglob("*.npz"))) == len(found)
@@ -204,7 +209,7 @@ def test_a_folder_keeps_a_scene_that_opens(own_desk, desk, desk_project, masks, 
     assert sha256_of_path(own_desk) == before
 
 
-def test_files_of_imported_poses_are_deleted_with_the_scene(desk, tmp_path, temporary):
+def test_files_of_imported_poses_are_deleted_with_the_scene(desk, tmp_path, temporary, monkeypatch):
     exported = tmp_path / "colmap"
     export_colmap(desk, exported)
     imported = hilsplat.load_scene(exported, test_every=0)
@@ -226,7 +231,8 @@ def test_files_of_imported_poses_are_deleted_with_the_scene(desk, tmp_path, temp
     assert folder.exists()
     del imported
     assert not folder.exists() and not list(temporary.iterdir())
-    kept = hilsplat.load_scene(exported, folder=tmp_path / "results/photos/kept")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    kept = hilsplat.load_scene("~/colmap", folder="~/results/photos/kept")
     assert kept.folder == tmp_path / "results/photos/kept/scene"
 
 

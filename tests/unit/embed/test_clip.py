@@ -12,7 +12,7 @@ from hilsplat.base.artifacts import read_index, read_npy, write_index, write_npz
 from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
 from hilsplat.base.lineage import sha256_of_path
 from hilsplat.configuration import parse_section
-from hilsplat.embed import stage
+from hilsplat.embed import clip, stage
 from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.stage import chosen_masks, run_clip
 from hilsplat.models import int8
@@ -191,6 +191,18 @@ def test_a_model_that_computes_no_usable_vectors_is_named(
     with pytest.raises(ModelError, match=rf"clip gives {problem}(.|\n)*another export"):
         run_clip(*inputs, ClipSettings(model=str(colour_clip)), threads=1)
     assert not (tmp_path / "broken").exists()
+
+
+def test_vectors_of_texts_do_not_accumulate(colour_clip, monkeypatch):
+    monkeypatch.setattr(clip, "MAX_TEXTS", 2)
+    model = ClipModel.load(colour_clip)
+    model.text = Mock(wraps=model.text)
+    expected = model.embed_texts(["red", "green", "blue"])
+    np.testing.assert_array_equal(model.embed_texts(["red", "green", "blue"]), expected)
+    assert model.text.call_count == 6
+    monkeypatch.setattr(clip, "MAX_TEXTS", 3)
+    model.embed_texts(["red"])
+    assert model.text.call_count == 6
 
 
 def test_a_text_without_a_vector_names_the_model(colour_clip, monkeypatch):
