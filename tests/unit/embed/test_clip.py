@@ -159,7 +159,7 @@ def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
     monkeypatch.setattr(logging.root.manager, "disable", logging.DEBUG)  # by the user
     with caplog.at_level("INFO"):
         run_clip(scene, masks, None, tmp_path / "auto", tmp_path / "cache", settings, threads=1)
-    assert logging.root.manager.disable == logging.DEBUG
+        assert logging.root.manager.disable == logging.DEBUG
     assert {record.name.partition(".")[0] for record in caplog.records} == {"hilsplat"}
     assert read_index(tmp_path / "auto")["precision"] == precision
     assert f"CLIP runs in {'int8' if precision == 'int8' else 'float32'}" in caplog.text
