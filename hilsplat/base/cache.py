@@ -161,12 +161,12 @@ def use_writable_cache() -> None:
 
     They would fail otherwise: numba, Snakemake and Matplotlib, in containers without a home.
     """
-    wanted = platformdirs.user_cache_path()
-    with suppress(OSError):
-        if wanted.is_absolute():
-            wanted.mkdir(parents=True, exist_ok=True)
-            if os.access(wanted, os.W_OK):
-                return
+    wanted = Path("~/.cache")
+    with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
+        wanted = platformdirs.user_cache_path()
+        wanted.mkdir(parents=True, exist_ok=True)
+        if os.access(wanted, os.W_OK):
+            return
     folder = _private_folder(tempfile.gettempdir())
     os.environ["XDG_CACHE_HOME"] = os.environ["MPLCONFIGDIR"] = str(folder)
     os.environ.setdefault("HOME", str(folder))
@@ -184,8 +184,9 @@ def writable(folder: Path) -> Path:
 
 
 def _folder(kind: str) -> Path:
-    folder = platformdirs.user_cache_path("hilsplat")  # "~/.cache/hilsplat" for a user without a home
-    return (folder if folder.is_absolute() else _private_folder(tempfile.gettempdir())) / kind
+    with suppress(RuntimeError):  # a user without a home
+        return platformdirs.user_cache_path("hilsplat") / kind
+    return _private_folder(tempfile.gettempdir()) / kind
 
 
 @functools.cache

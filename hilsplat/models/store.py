@@ -7,6 +7,7 @@ import csv
 import functools
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,8 +87,11 @@ def planned_model(folder: Path) -> PresentModel | None:
 
 def user_models() -> Path:
     """Return the folder of downloaded models, shared by all projects of a user."""
-    named = os.environ.get("HILSPLAT_MODELS")
-    return Path(named).expanduser() if named else platformdirs.user_data_path("hilsplat") / "models"
+    if named := os.environ.get("HILSPLAT_MODELS"):
+        return Path(named).expanduser()
+    with suppress(RuntimeError):
+        return platformdirs.user_data_path("hilsplat") / "models"
+    return Path("~/.local/share/hilsplat/models")  # missing, because the user has no home
 
 
 def model_path(path: str | Path) -> Path:

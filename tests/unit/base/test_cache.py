@@ -218,7 +218,7 @@ def test_an_entry_that_another_node_prunes_is_still_read(tmp_path: Path, monkeyp
 
 def test_a_user_without_a_home_has_a_cache_among_the_temporary_files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("platformdirs.user_cache_path", lambda *name: Path("~/.cache", *name))
+    monkeypatch.setattr("platformdirs.user_cache_path", Mock(side_effect=RuntimeError("no home")))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     (tmp_path / "temporary").mkdir()
     examine = Mock(return_value="fast")

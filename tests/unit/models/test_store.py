@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -100,3 +101,9 @@ def test_a_damaged_cache_of_digests_is_replaced(models, memo):
     model_digest.cache_clear()
     assert model_digest(models / "sam-tiny", cache.parent) == expected
     assert json.loads(cache.read_text()).keys() >= paths
+
+
+def test_a_user_without_a_home_has_no_models(models, monkeypatch):
+    monkeypatch.delenv("HILSPLAT_MODELS", raising=False)
+    monkeypatch.setattr("platformdirs.user_data_path", Mock(side_effect=RuntimeError("no home")))
+    assert real_model("clip") is None
