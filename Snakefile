@@ -83,7 +83,7 @@ wildcard_constraints:
     variant=any_of(PLAN.run.every_variant()),
 
 
-# What the rules of all stages share; it is no target.
+# What the rules of all stages share; it is no target. With -P, no module is imported from the working folder.
 rule stage:
     log:
         "<results>/logs/stage.log",
