@@ -56,6 +56,7 @@ class FinishedScene:
         Input paths are read from provenance; without it, each is expected beside the artifact made from it. A
         variant may share the field recorded in the provenance of its scores. During a run, the variant's own
         CLIP vectors are sufficient. Until `default` has any, those of the key views are used, with a warning.
+        While a run rebuilds the scene, what it has already made precedes what is left of the previous run.
 
         Raises:
             ArtifactError: the folder, the variant or a part is missing.
@@ -66,18 +67,18 @@ class FinishedScene:
         field = _recorded_input(scores, "field", folder) or new
         if field != new and new.exists() and new.stat().st_mtime > provenance_path(scores).stat().st_mtime:
             field = new  # it is not scored yet
-        clip = folder / variant / "clip"
-        if variant == "default" and not (clip.exists() or field.exists()):
-            early = folder / KEY_VIEWS / "clip"
-            if early.exists():
-                clip = early
-                logger.warning("%s", refining(folder))
+        own, early = (folder / name / "clip" for name in (variant, KEY_VIEWS))
+        usable = [field, own, *([early] if variant == "default" else [])]
+        made = [path for path in usable if path.exists()]
+        if not made:  # `default` has its own vectors; other variants may share them
+            raise _unfinished(folder, own if variant == "default" else field)
+        clip = next((path for path in made if not changed_input(path, folder)), made[0])
         autoencoder = None
-        if field.exists():
+        if clip == field:
             autoencoder = input_of(field, "autoencoder", folder)
             clip = input_of(autoencoder, "clip", folder)
-        elif not clip.exists():  # `default` has its own vectors; other variants may share them
-            raise _unfinished(folder, clip if variant == "default" else field)
+        elif clip != own:
+            logger.warning("%s", refining(folder))
         tree = input_of(autoencoder or clip, "semantic_tree", folder)
         used_field, masks = field if autoencoder else None, input_of(clip, "masks", folder)
         gaussians = folder / "gaussians.ply"

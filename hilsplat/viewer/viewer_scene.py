@@ -131,8 +131,9 @@ class ViewerScene(ShownScene):
             HilsplatError: a part cannot be opened.
         """
         field = self.folder / variant / "field.safetensors"
-        _, scene = self._variants.get(variant, (None, None))
-        if scene is None or (scene.decoded_field is None and field.exists()):
+        parts, scene = self._variants.get(variant, (None, None))
+        is_new = scene is not None and scene.decoded_field is None and field.exists()
+        if scene is None or (is_new and FinishedScene.locate(self.folder, variant).parts != parts):
             if variant not in self.variants:  # reject anything but listed names, such as paths
                 raise SettingsError(
                     f"variant {variant!r} cannot be queried here",

@@ -284,6 +284,37 @@ def test_a_variant_uses_the_parts_recorded_in_its_scores_or_those_that_exist(tmp
         FinishedScene.locate(folder, "x")
 
 
+def test_while_a_scene_is_rebuilt_new_parts_precede_those_of_the_previous_run(tmp_path, monkeypatch):
+    folder = bear_without(tmp_path)
+    monkeypatch.setattr("hilsplat.scene.finished.refining", lambda folder: "few photographs")
+    for part in ("clip", "masks", "semantic_tree"):
+        (folder / "key-views" / part).mkdir(parents=True)
+
+    def make(name: str, poses: str) -> None:
+        inputs = {"scene": {"path": str(folder / "scene"), "sha256": poses}}
+        write_record(folder / name, inputs=inputs)
+
+    def used() -> tuple[str, bool]:
+        parts = FinishedScene.locate(folder).parts
+        return parts.clip.parent.name, parts.field is not None
+
+    def rebuild(poses: str) -> None:
+        write_record(folder / "scene", outputs={"scene": {"sha256": poses, "bytes": {}}})
+
+    rebuild("old")
+    vectors = ("default/clip", "default/field.safetensors", "key-views/clip")
+    for name in vectors:
+        make(name, "old")
+    assert used() == ("default", True)
+    rebuild("new")
+    assert used() == ("default", True)  # nothing is new yet: opening it names what changed
+    for name, expected in (("key-views", False), ("default", False)):
+        make(f"{name}/clip", "new")
+        assert used() == (name, expected)
+    make("default/field.safetensors", "new")
+    assert used() == ("default", True)
+
+
 def test_the_field_answers_through_the_same_interface(scene):
     hits = scene.query("B", "whole", answerer="field")
     assert hits[0].node == NODE["B"]
