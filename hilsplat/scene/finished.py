@@ -111,7 +111,7 @@ class FinishedScene:
 
 def scenes_in(results: Path) -> list[str]:
     """Return the names, `<dataset>/<scene>`, of the scenes of a results folder that have poses."""
-    places = [path for path in results.glob("*/*") if (path / "scene" / INDEX).is_file()]
+    places = [path.parents[1] for path in results.glob(f"*/*/scene/{INDEX}")]  # skips unreadable folders
     return sorted(f"{path.parent.name}/{path.name}" for path in places)
 
 
@@ -125,10 +125,16 @@ def command_name(folder: Path) -> str:
     return str(folder.relative_to("results") if folder.parts[0] == "results" else folder)
 
 
+def holds_scenes(folder: Path) -> bool:
+    """Return whether a folder is or has scenes, as a folder of photographs with a scene's name has not."""
+    return any(any(folder.glob(place)) for place in ("scene", "*/scene", "*/*/scene"))
+
+
 def require_scene_folder(folder: Path) -> None:
     """Raise ArtifactError, with known scenes, if a folder does not exist or contains scenes."""
     around = folder.absolute().parent
-    inside = scenes_in(folder) or matching_scenes(scenes_in(around), f"{folder.name}/*")
+    below = [f"{folder.name}/{path.parents[1].name}" for path in folder.glob(f"*/scene/{INDEX}")]
+    inside = scenes_in(folder) or sorted(below)
     if folder.is_dir() and not inside:
         return
     known = inside or scenes_in(around) or scenes_in(around.parent)  # results/desk, or results/photos/desk

@@ -258,10 +258,14 @@ def test_masks_do_not_replace_the_picture_of_their_answer(desk, elsewhere):
     assert {path.name for path in Path("a").iterdir()} >= {"panel.png", "selection.ply", "masks"}
 
 
-def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path):
+def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path, monkeypatch):
     results = desk_project / "results"
     assert scene_folder("desk", results) == scene_folder("photos/desk", results) == results / "photos/desk"
     assert scene_folder(str(results / "photos/desk"), Path("elsewhere")) == results / "photos/desk"
+    (tmp_path / "lamp").mkdir()  # its photographs
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ArtifactError, match=r"results/lamp is missing(.|\n)*hilsplat run SCENE"):
+        scene_folder("lamp", Path("results"))
     for dataset in ("photos", "synthetic"):
         shutil.copytree(results / "photos/desk/scene", tmp_path / dataset / "desk/scene")
     with pytest.raises(SettingsError, match=r"several scenes(.|\n)*photos/desk, synthetic/desk"):
