@@ -117,14 +117,13 @@ class Plan:
             )
         require_variant_sections(run)
         sheet = project_path(run.scenes)
-        rows = read_sheet(sheet, run.groups, run.data_root)
+        rows = read_sheet(sheet, (), run.data_root)
         names_of_data = unlisted({row.source for row in rows}, run.groups, run.data_root)
         self.rows = (*rows, *(row_of_data(name, run.data_root) for name in names_of_data))
         self.ignored = without_scene(run, [*self.rows, *read_sheet(INSTALLED / DEFAULT_SHEET, ())])
         self.data = SceneData(self.rows, run.data_root, self.path)
         chosen = choose_scenes(self.rows, run.groups, run.only)
-        if more := {row.group for row in chosen} - set(run.groups):  # check their sources too
-            read_sheet(sheet, {*run.groups, *more}, run.data_root)
+        read_sheet(sheet, {row.name for row in chosen}, run.data_root)  # checks their sources
         reasons = {row.name: self.data.absence(row) for row in chosen}
         self.absent = {name: reason for name, reason in reasons.items() if reason is not None}
         self.scenes = tuple(row for row in chosen if row.name not in self.absent)

@@ -229,7 +229,8 @@ class SceneData:
 def _images_of(row: SceneRow, files: Iterable[str]) -> list[Path]:
     """Return the photographs among the files of a source, without copies in other folders."""
     images = largest_copies([path for path in map(Path, files) if path.suffix.lower() in IMAGE_SUFFIXES])
-    assert row.folder is not None  # as of all sources with photographs
+    if not images or row.folder is None:
+        return images
     folder = Path(portable(photo_folder(row.folder)))
     return [path for path in images if folder in path.parents] or images
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.base.errors import HilsplatError, SceneError, SettingsError
 from hilsplat.configuration import merged_config, parse_run
 from hilsplat.scene.sheet import read_sheet
 from hilsplat.settings import MasksSettings
@@ -333,6 +333,21 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
         assert not re.match(guided.jobs_of(name), "synthetic/one/default/")
     assert guided.of_key_views("masks")(desk) == "results/photos/desk/key-views/masks"
     assert not plan(tmp_path, **(config | {"variants": {}})).first_answer(desk)
+
+
+def test_the_missing_folder_of_another_scene_stops_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "hilsplat.workflow.plan.planned_model", lambda folder: SimpleNamespace(embedded=False)
+    )
+    rows = (*ROWS, f"photos gone photos {tmp_path / 'gone'} arbitrary")
+    (tmp_path / "desk").mkdir()
+    (tmp_path / "desk/1.jpg").touch()
+    found = plan_of(
+        tmp_path, rows, variants={"key-views": {"masks": {"key_views": 0.5}}}, only=["photos/desk"]
+    )
+    assert [row.name for row in found.scenes] == ["photos/desk"] and found.jobs_of("key_masks")
+    with pytest.raises(SceneError, match=r"gone is missing"):
+        plan_of(tmp_path, rows, only=["photos/gone"])
 
 
 @pytest.mark.parametrize("beside", ["input", "images_train", "object_mask", "images_4"])
