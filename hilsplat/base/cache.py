@@ -1,5 +1,6 @@
 """Caches: finished views and checkpoints, their sizes and pruning, and examinations of this machine."""
 
+import getpass
 import logging
 import os
 import re
@@ -160,6 +161,10 @@ def use_writable_cache() -> None:
 
     They would fail otherwise: numba, Snakemake and Matplotlib, in containers without a home.
     """
+    try:
+        getpass.getuser()
+    except (KeyError, OSError):  # a user without a name; Snakemake prints it
+        os.environ["LOGNAME"] = str(os.getuid())
     wanted = Path("~/.cache")
     with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
         wanted = platformdirs.user_cache_path()
@@ -174,7 +179,6 @@ def use_writable_cache() -> None:
         folder = Path(tempfile.mkdtemp(prefix="hilsplat-"))
     os.environ["XDG_CACHE_HOME"] = os.environ["MPLCONFIGDIR"] = str(folder)
     os.environ.setdefault("HOME", str(folder))
-    os.environ.setdefault("LOGNAME", str(os.getuid()))  # a user without a name
     logger.info("%s cannot be written; caches are kept in %s", wanted, folder)
 
 

@@ -71,8 +71,11 @@ def sha256_of_path(path: Path) -> str:
     return sha256_of_json([(file.relative_to(path).as_posix(), sha256_of_file(file)) for file in files])
 
 
+UNREADABLE = "unreadable"
+
+
 def digests_of(paths: Collection[str], memo: Path) -> dict[str, str]:
-    """Map each path to its file's SHA-256, or "unreadable"; only files that changed since `memo` are read.
+    """Map each path to its file's SHA-256, or `UNREADABLE`; only files that changed since `memo` are read.
 
     Programs cannot set the status change time, so it reveals a replacement of the same size and time.
     """
@@ -96,7 +99,7 @@ def digests_of(paths: Collection[str], memo: Path) -> dict[str, str]:
             list(threads.map(read, changed))
         with suppress(OSError, HilsplatError):  # a read-only folder of results, or a full disk
             write_json(memo, old | entries)
-    return {path: entries.get(path, "unreadable").split()[-1] for path in paths}
+    return {path: entries.get(path, UNREADABLE).split()[-1] for path in paths}
 
 
 def visible_files(folder: Path) -> list[Path]:

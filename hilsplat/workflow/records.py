@@ -16,8 +16,10 @@ from hilsplat.base.artifacts import RUN, provenance_path, run_command
 from hilsplat.base.atomic import was_interrupted
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.lineage import (
+    UNREADABLE,
     Provenance,
     artifacts_in,
+    digests_of,
     files_of,
     read_provenance,
     sha256_of_path,
@@ -153,6 +155,11 @@ class Records:
                 yield f"it was made with seed {record.seed}, not {seed}"
             options = {name: self.plan.options[name](job) for name in OPTIONS if name in stage.hints}
             yield from self._other_options(stage, record, options)
+            images, photographs = record.inputs.get("images"), self.plan.data.image_files(job)
+            if images is not None and images.files is not None and isinstance(photographs, list):
+                now = digests_of(photographs, self.plan.data.memo(job))
+                if sorted(now.values()) != sorted(filter(None, images.files.values())):
+                    yield "it was made from other photographs"  # perhaps by another project
         try:
             code = stage.code_digest(record.plugins)
         except HilsplatError:  # this version does not have the reader
@@ -162,6 +169,10 @@ class Records:
         written, paths = self._written_results(artifact, record), set[str]()
         for name, read in record.inputs.items():
             files = {read.path: read.sha256} if read.files is None else read.files
+            outside = [file for file in files if not Path(file).is_relative_to(written)]
+            if self.plan is not None and job is not None and not self.every_byte and name != "model":
+                found = digests_of(outside, self.plan.data.memo(job))
+                self._digests |= {Path(file): found[file] for file in outside if found[file] != UNREADABLE}
             for file, digest in files.items():
                 inside = Path(file).is_relative_to(written)
                 path = self.results / Path(file).relative_to(written) if inside else Path(file)

@@ -113,10 +113,13 @@ class SceneData:
             if isinstance(paths, str):
                 paths = []  # a folder that a rule writes
             _require_past(paths)
-            memo = Path(self.path(job)).parents[1] / ".cache/inputs" / job.dataset / f"{job.scene}.json"
-            return self._digest(memo if paths else None, *paths)
+            return self._digest(self.memo(job) if paths else None, *paths)
 
         return digest
+
+    def memo(self, job: Job) -> Path:
+        """Return the file that remembers the digests of a scene's files from outside (`digests_of`)."""
+        return Path(self.path(job)).parents[1] / ".cache/inputs" / job.dataset / f"{job.scene}.json"
 
     def require_no_braces(self, row: SceneRow) -> None:
         """Raise SettingsError for file names with braces, which Snakemake interprets as wildcards."""

@@ -12,6 +12,7 @@ import pytest
 
 from hilsplat.base.artifacts import run_command
 from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.base.processes import boot_id
 from hilsplat.cli.main import app
 from hilsplat.workflow import run as runs
 from hilsplat.workflow.plan import Plan
@@ -197,6 +198,12 @@ def test_the_locks_of_another_machine_stay(folder, started, unlocked, caplog):
     assert unlocked == [] and "another machine may be running" in caplog.text
     runs.run([], [], ["--unlock"])
     assert "unlock" in unlocked and list(runs.STATE.glob("run-*")) == []
+    unlocked.clear()
+    leave_marker(
+        f"elsewhere {boot_id()}"
+    )  # a container of this machine, which has another name at each start
+    runs.run([], [], [])
+    assert unlocked == ["unlock"]
 
 
 def test_options_of_the_command_need_no_separator(folder, started, monkeypatch):
