@@ -100,7 +100,7 @@ class SceneData:
         return [*map(Path, self.source_files(job))] if is_exported(row.source) else self._photographs(row)
 
     def num_images(self, job: Job) -> int:
-        """Return the number of photographs, as far as files tell."""
+        """Return the number of photographs, estimated if they are inside other files."""
         source, files = self.row(job).source, self.photographs(job)
         names = published(source) if is_exported(source) else None
         return DATASETS[names[0]].num_images(files) if names else len(files)
@@ -118,7 +118,7 @@ class SceneData:
         return digest
 
     def memo(self, job: Job) -> Path:
-        """Return the file that remembers the digests of a scene's files from outside (`digests_of`)."""
+        """Return the memo of the digests of a scene's files outside the results (`digests_of`)."""
         return Path(self.path(job)).parents[1] / ".cache/inputs" / job.dataset / f"{job.scene}.json"
 
     def require_no_braces(self, row: SceneRow) -> None:
