@@ -55,7 +55,7 @@ def end_with_parent(parent: int) -> None:
 
 def _watch(parent: int) -> None:
     with suppress(OSError, AttributeError):  # without pidfd, or already gone
-        select.select([os.pidfd_open(parent)], [], [])  # also if its parent does not await it, as in a container
+        select.select([os.pidfd_open(parent)], [], [])  # also if its parent doesn't await it
         os._exit(1)
     while is_alive(parent):
         time.sleep(1)

@@ -1,4 +1,4 @@
-"""The groups of the Slurm profile, which Snakemake refuses if a job outside reads one and is read by another."""
+"""Groups of the Slurm profile; Snakemake refuses them if a job outside reads one and is read by another."""
 
 import pytest
 import yaml

@@ -358,3 +358,15 @@ def test_key_views_are_queried_until_the_vectors_of_all_views_exist(desk, tmp_pa
     expected = [key / name for name in ("clip", "semantic_tree", "masks")]
     assert [parts.clip, parts.semantic_tree, parts.masks] == expected and parts.field is None
     assert re.search(r"photos/desk uses \d+ of \d+ photographs until the run ends", caplog.text)
+
+
+def test_results_of_another_user_answer_and_name_the_option_for_files(desk, capsys, monkeypatch):
+    can, own = os.access, str(desk)  # root may write everywhere
+
+    def access(path, mode: int, **more: bool) -> bool:
+        return can(path, mode, **more) and not (mode == os.W_OK and str(path).startswith(own))
+
+    monkeypatch.setattr(os, "access", access)
+    with pytest.raises(SettingsError, match=r"queries(.|\n)*cannot be written(.|\n)*--out"):
+        run("query", str(desk), "mug")
+    assert "mug" in capsys.readouterr().out and not (desk / "queries").exists()
