@@ -36,7 +36,7 @@ def ovs_cells(_: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
 
 
 def averaged_scenes(data: str) -> set[str]:
-    """Return the scenes of a data set that its averages without levels cover; empty for all that are scored."""
+    """Return the scenes of a data set that averages without levels cover; empty for all that are scored."""
     listed = DATASETS[data].scenes if data in DATASETS else ()
     return {*(TABLES["3dovs"].averaged if data == "3d_ovs" else listed)}
 
@@ -66,7 +66,7 @@ def ablation_blocks(kind: TableKind, sources: Sources) -> list[Block]:
 
 
 def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
-    """Return the values of one row from its scores under all protocols, also without levels (`flat_scores`)."""
+    """Return the values of one row under all protocols; `flat_scores` selects those without levels."""
     flat = flat_scores(scores, part, ("lerf/langsplat@", "lerf/tree-nodes@"), "lerf_ovs")
     ovs = flat_scores(scores, part, ("3d-ovs/langsplat@",), "3d_ovs")
     levels = measured.level_cells(part)

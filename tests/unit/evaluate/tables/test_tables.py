@@ -141,6 +141,26 @@ def test_a_scene_has_one_column_and_rows_over_part_of_the_scenes_say_so(tmp_path
     assert half.count("90.0") == 2 and half.count("**90.0**") == 1  # best in its scene, not on average
 
 
+def test_only_rows_of_comparable_protocols_are_ranked_together(tmp_path):
+    """Values in % of the rows in bold: fields and trees, other rules for maps, masks of files."""
+    values = {
+        "lerf/langsplat@3": (("field", 0.41, "default"), ("field", 0.42, "other")),
+        "lerf/tree-nodes@6": (("tree", 0.43, "default"),),
+        "lerf/paper-mean@3": (("field", 0.51, "default"), ("field", 0.52, "other")),
+        "lerf/langsplat@3 (filter 20)": (("field", 0.61, "default"),),
+        "lerf/langsplat@3 (masks of files)": (("files", 0.71, "a"), ("files", 0.72, "b")),
+        "lerf/paper-mean@3 (masks of files)": (("files", 0.71, "a"), ("files", 0.72, "b")),
+    }
+    scores = [
+        score("iou", value, protocol=protocol, method=method, variant=variant, level="")
+        for protocol, rows in values.items()
+        for method, value, variant in rows
+    ]
+    _, forms = built(tmp_path, "lerf", scores)
+    (*_, block) = forms[".md"].split("## ")
+    assert sorted(re.findall(r"\*\*(\d\d)\.0\*\* \|$", block, re.MULTILINE)) == ["43", "52", "72", "72"]
+
+
 def test_seeds_of_some_scenes_do_not_change_the_mean_over_all(tmp_path):
     scores = [score("iou", 0.3, scene=scene, variant="v", method="field", **LERF) for scene in "abcd"]
     scores.append(score("iou", 0.9, scene="a", variant="v.seed1", method="field", **LERF))
