@@ -1,5 +1,7 @@
 """The evaluate and figures stages, and the scores of labels of published data sets."""
 
+import json
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -100,6 +102,20 @@ def test_labels_give_the_scores_of_the_same_annotations_and_flat_ones_those_of_l
     assert set(flat["view"]) == {"000.png", "001.png"}
     held_out = flat[flat["view"] == "001.png"]
     assert held_out.reset_index(drop=True).equals(of_lerf.reset_index(drop=True))
+
+
+def test_annotations_of_scenes_with_one_name_in_two_data_sets_are_scores_of_two_scenes(opened, tmp_path):
+    folder = tmp_path / "annotated/lerf/blocks"
+    folder.mkdir(parents=True)
+    square = [[8, 8], [40, 8], [40, 40], [8, 40]]
+    bear = {"category": "bear", "segmentation": square, "bbox": [8, 8, 40, 40], "level": 1, "id": 1}
+    labels = {"info": {"width": 64, "height": 64, "name": "001.jpg"}, "objects": [bear]}
+    (folder / "001.json").write_text(json.dumps(labels))
+    (folder.parents[1] / "lerf_mask").symlink_to(folder.parent)
+    for data in ("lerf", "lerf_mask"):
+        own = {"labels": [f"annotated/{data}/blocks"], "data_root": tmp_path, "truth": None}
+        scores = opened.evaluate(tmp_path / "scores.csv", dataset=data, **own)
+        assert {*scores["dataset"]} == {"annotated"} and {*scores["scene"]} == {f"{data}/blocks"}
 
 
 def test_labelled_views_without_pose_and_labels_of_another_shape_are_refused(block_world, rows):
