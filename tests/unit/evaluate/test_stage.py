@@ -15,7 +15,7 @@ from hilsplat.datasets.registry import open_labelled
 from hilsplat.evaluate.costs import TIME_COLUMNS
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.figures import panel
-from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.protocols.view_truth import ViewTruth, truths_of
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 from tests.unit.evaluate.builders import box, region_of
 
@@ -156,6 +156,17 @@ def test_labels_shrink_as_public_evaluators_shrink_them():
     (dots,) = ViewTruth.of_regions([region_of(mask, "dots")], (16, 16), (34, 44)).categories
     assert dots.truth.all()
     small = Image.fromarray(mask).resize((5, 4), Image.Resampling.NEAREST)
+    np.testing.assert_array_equal(dots.eighth, np.asarray(small))
+
+
+def test_an_eighth_is_that_of_the_image_also_if_poses_shrank_it(block_world, tmp_path):
+    mask = np.random.default_rng(0).random((128, 128)) < 0.5
+    write_png(tmp_path / "001.png", np.zeros((128, 128, 3), np.uint8))
+    images, regions = {"001.png": tmp_path / "001.png"}, (region_of(mask, "dots"),)
+    known = LabelledScene("3d_ovs", "blocks", images, None, {"001.png": regions})
+    (dots,) = truths_of(known, block_world.scene, 0)["001.png"]().categories
+    assert dots.truth.shape == (64, 64)
+    small = Image.fromarray(mask).resize((16, 16), Image.Resampling.NEAREST)
     np.testing.assert_array_equal(dots.eighth, np.asarray(small))
 
 
