@@ -68,7 +68,9 @@ def test_only_held_out_views_are_judged(project, psnr_db, split, words):
 def test_a_scene_without_a_tree_continues_with_a_run(project):
     shutil.rmtree("results/photos/desk/default")
     assert described(project)["next"] == "hilsplat run photos/desk"
-    runs.record_run(Path("results"), [Path("config/mine.yaml")], {"seed": 5})
+    runs.record_run(
+        plan_of(project, ROWS, groups=["photos"]), [Path("config/mine.yaml")], {"seed": 5, "only": ["desk"]}
+    )
     assert (
         described(project)["next"] == "hilsplat run --config config/mine.yaml photos/desk -- --config seed=5"
     )
