@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,12 @@ class TableKind:
     steps: Mapping[str, str] = field(default_factory=dict)
     ranked_together: tuple[str, ...] = ()
     footnotes: tuple[str, ...]
+
+    @property
+    def has_levels(self) -> bool:
+        """Whether its measured rows need labels with levels."""
+        prefixes = [*chain(*self.protocols)]
+        return bool(prefixes) and all(prefix.startswith("hierarchy/") for prefix in prefixes)
 
     def ranked_with(self, protocol: str) -> str:
         """Return the ranking group of rows with a protocol's full name; non-default settings are compared."""
