@@ -133,7 +133,7 @@ onstart:
     except HilsplatError as error:  # another run writes to the same results
         raise WorkflowError(str(error)) from None
     record_run(
-        PLAN.results,
+        PLAN,
         workflow.config_settings.configfiles,
         workflow.config_settings.config,
     )

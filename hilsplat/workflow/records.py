@@ -82,7 +82,8 @@ def verify(results: Path) -> tuple[str, bool]:
     lines.append(f"{len(artifacts)} artifacts in {results}: {states}")
     is_whole = counts[WHOLE] == len(artifacts)
     if not is_whole:
-        root = next((path for path in results.resolve().parents if (path / RUN).is_file()), results)
+        folder = results.resolve()
+        root = next((path for path in (folder, *folder.parents) if (path / RUN).is_file()), results)
         lines.append(f"to rebuild them, in the project that made them: {run_command(root, '--verify')}")
     return "\n".join(lines), is_whole
 

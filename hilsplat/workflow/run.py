@@ -24,7 +24,7 @@ from typing import Any
 
 import yaml
 
-from hilsplat.base.artifacts import RUN, write_json, write_text
+from hilsplat.base.artifacts import RUN, read_memo, write_json, write_text
 from hilsplat.base.errors import HilsplatError, SettingsError, nearest
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.base.processes import (
@@ -92,11 +92,16 @@ def mark_run(results: Path) -> None:
     _held.append(marker)
 
 
-def record_run(results: Path, configs: Sequence[Path], overrides: Mapping[str, Any]) -> None:
-    """Record a run's configuration in the results, for the commands that messages suggest (`run_command`)."""
+def record_run(plan: Plan, configs: Sequence[Path], overrides: Mapping[str, Any]) -> None:
+    """Record a run's options in its results and scenes, for the commands in messages (`run_command`)."""
     files = [_config_name(Path(path)) for path in configs]
     values = [f"{key}={json.dumps(value)}" for key, value in overrides.items() if key != "only"]
-    write_json(results / RUN, {"results": [str(results)], "config": files, "overrides": values})
+    run = {"results": [str(plan.results)], "config": files, "overrides": values}
+    write_json(plan.results / RUN, run)
+    for row in plan.scenes:
+        record, path = {"scene": [row.name], **run}, Path(plan.path(row), RUN)
+        if read_memo(path, dict[str, list[str]]) != record:  # few of a thousand scenes change
+            write_json(path, record)
 
 
 def _config_name(path: Path) -> str:

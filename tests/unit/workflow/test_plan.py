@@ -401,6 +401,86 @@ def test_tables_have_their_own_scenes_and_variants(tmp_path):
     assert variants_in(targets.scores(with_network, "replica")) == ["default", "network", "network.seed1"]
 
 
+OF_BENCHMARKS = (
+    *(f"lerf {name} lerf data:lerf_ovs/{name} arbitrary" for name in ("figurines", "ramen")),
+    *(f"3d_ovs {name} 3d_ovs data:3d_ovs/{name} arbitrary" for name in ("bed", "snacks")),
+    "synthetic one benchmark world:tabletop:1 metre",
+    "rooms room benchmark world:room:1 metre",
+)
+
+
+def plan_of_benchmarks(folder: Path, *label_files: str, **config: object) -> Plan:
+    """The plan of scenes of LERF and 3D-OVS with their own labels, and with the given label files."""
+    places = [
+        f"lerf_ovs/{part}"
+        for name in ("figurines", "ramen")
+        for part in (f"{name}/sparse/0", f"label/{name}")
+    ]
+    places += [f"lerf_ovs/{name}/images" for name in ("figurines", "ramen")]
+    places += [f"3d_ovs/{name}/{part}" for name in ("bed", "snacks") for part in ("images", "segmentations")]
+    for place in places:
+        (folder / place).mkdir(parents=True, exist_ok=True)
+    files = [f"3d_ovs/{name}/segmentations/classes.txt" for name in ("bed", "snacks")]
+    for file in (*files, *label_files):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).touch()
+    defaults = {"groups": ["lerf", "3d_ovs"], "data_root": str(folder), "main_variants": ["default"]}
+    sweeps = {"theta_variants": ["theta"], "pruning_variants": ["omega"]}
+    return plan_of(folder, OF_BENCHMARKS, **{"variants": VARIANTS, **defaults, **sweeps, **config})
+
+
+def test_tables_of_levels_have_the_scenes_whose_labels_have_levels(tmp_path):
+    def scenes(found, table):
+        return ["/".join(path.split("/")[1:3]) for path in targets.scores(found, table)]
+
+    tables = ("theta", "pruning", "hierarchy")
+    found = plan_of_benchmarks(tmp_path, groups=["lerf", "3d_ovs", "benchmark"])
+    assert [scenes(found, name) for name in tables[:2]] == [["synthetic/one"]] * 2
+    assert scenes(found, "lerf") == ["lerf/figurines", "lerf/ramen", "synthetic/one"]
+    assert {line.partition(" has ")[0] for line in targets.absent(found, "theta")} == {
+        f"hi_lerf (figurines, ramen): {tmp_path}/hi_lerf",
+        f"hi_3dovs (bed, snacks): {tmp_path}/hi_3dovs",
+    }
+    assert targets.absent(found, "lerf") == []
+    own = "annotated/lerf/ramen/1.json"
+    assert [scenes(plan_of_benchmarks(tmp_path / "own", own), name) for name in tables] == [
+        ["lerf/ramen"]
+    ] * 3
+    # rows of Hi-LERF have a column of 3D-OVS in sweeps, over scenes that are averaged, but not in pruning
+    found = plan_of_benchmarks(tmp_path / "hi", "hi_lerf/label/figurines/1.json")
+    of_lerf = ["lerf/figurines"]
+    assert [scenes(found, name) for name in tables] == [[*of_lerf, "3d_ovs/bed"], of_lerf, of_lerf]
+    assert targets.absent(found, "frames-hi-lerf") == [
+        f"hi_lerf (ramen): {tmp_path}/hi/hi_lerf has no labels with levels."
+    ]
+
+
+def test_a_run_of_some_scenes_makes_their_tables_and_names_the_scenes_left_out(tmp_path, monkeypatch):
+    def tables(found):
+        return [Path(path).stem for path in targets.default(found) if "/tables/" in path]
+
+    monkeypatch.chdir(tmp_path)
+    found = plan_of_benchmarks(tmp_path)
+    assert tables(found) == ["lerf", "3dovs", "cost", "cost-seconds"]
+    assert "results/figures/sweep-theta.png" not in targets.default(found)
+    one = plan_of_benchmarks(tmp_path, only=["lerf/ramen"])
+    assert tables(one) == ["lerf", "cost", "cost-seconds"]
+    assert len(targets.tables(one)) > 10, "the rule `tables` makes all"
+    assert {"lerf", "hierarchy", "theta"} <= {*tables(plan_of_benchmarks(tmp_path, groups=["benchmark"]))}
+    # A data set of the run that is missing is listed in its table.
+    rows = (*OF_BENCHMARKS, "waymo street waymo data:waymo/street metre")
+    lacking = {"groups": ["lerf", "waymo"], "data_root": str(tmp_path)}
+    assert {"lerf", "waymo"} <= {*tables(plan_of(tmp_path, rows, **lacking))}
+    assert "waymo" not in tables(plan_of(tmp_path, rows, **lacking, only=["ramen"]))
+
+    assert targets.left_out(one) == []
+    for scene in ("lerf/figurines", "synthetic/one", "rooms/room", "lerf/ramen"):
+        file = Path("results", scene, "default/scores.csv")
+        file.parent.mkdir(parents=True)
+        file.touch()
+    assert targets.left_out(one) == ["lerf/figurines", "synthetic/one"]  # rooms have other tables
+
+
 def test_a_run_of_photographs_leaves_tables_alone(tmp_path):
     assert targets.default(plan(tmp_path, groups=["photos"])) == [
         "results/figures/photos/desk/panel.webp",

@@ -155,6 +155,33 @@ def test_the_number_of_gaussians_is_read_from_the_header_of_a_ply(tmp_path):
     assert vertex_count(tmp_path / "other.ply") is None and vertex_count(tmp_path / "none.ply") is None
 
 
+def test_frozen_gaussians_are_counted_in_the_mesh(tmp_path):
+    scan = tmp_path / "scannet/scans/scene0000_00"
+    for part in ("color/0.jpg", "pose/0.txt", "intrinsic/intrinsic_color.txt"):
+        (scan / part).parent.mkdir(parents=True, exist_ok=True)
+        (scan / part).touch()
+    rows, job = (
+        ("scannet scene0000_00 scannet data:scannet/scene0000_00 metre",),
+        Job("scannet", "scene0000_00"),
+    )
+
+    def costs(vertices: int, **fit: object) -> list[float]:
+        header = f"ply\nformat binary_little_endian 1.0\nelement vertex {vertices}\nend_header\n"
+        for name in ("ply", "labels.ply", "0.010000.segs.json"):
+            (scan / f"scene0000_00_vh_clean_2.{name}").write_text(header)
+        (scan / "scene0000_00.aggregation.json").touch()
+        config = {"data_root": str(tmp_path), "gaussians": {"max_gaussians": 2_000_000, **fit}}
+        found = JobResources(plan_of(tmp_path, rows, groups=["scannet"], **config))
+        of_job = [
+            getattr(found, name)("gaussians", job) for name in ("core_seconds", "card_seconds", "disk_mb")
+        ]
+        return [found.gaussians(found.plan.scenes[0]), *of_job]
+
+    small, large, growing = costs(80_000, initial="frozen"), costs(200_000, initial="frozen"), costs(80_000)
+    assert [each[0] for each in (small, large, growing)] == [80_000, 200_000, 2_000_000]
+    assert all(low < middle < high for low, middle, high in zip(small, large, growing, strict=True))
+
+
 def test_memory_grows_with_the_model_and_with_views_at_once(tmp_path):
     folder = tmp_path / "models/sam"
     shutil.copytree(PROJECT / "models/sam-tiny", folder)
