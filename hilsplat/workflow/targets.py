@@ -124,7 +124,7 @@ def tables(plan: Plan) -> list[str]:
 
 
 def of_run(plan: Plan) -> list[str]:
-    """Return the names of the tables with scores of this run, or with data that it lacks.
+    """Return the names of the tables with scores of this run, with data that it lacks, or not yet made.
 
     The others would lose the measured rows of earlier runs, as would all tables in a run of photographs.
     """
@@ -133,8 +133,10 @@ def of_run(plan: Plan) -> list[str]:
     lacking = {table for row in plan.rows if row.name in plan.absent for table in tables_of(row)}
     if not plan.run.only:
         lacking.update(*(DATASETS[name].tables for name in _not_found(plan)))
-    every = [Path(path).stem for path in tables(plan)]
-    return [name for name in every if name in lacking or scores(plan, name)]
+    paths = {Path(path).stem: Path(path) for path in tables(plan)}
+    return [
+        name for name, path in paths.items() if name in lacking or scores(plan, name) or not path.exists()
+    ]
 
 
 def left_out(plan: Plan) -> list[str]:

@@ -4,7 +4,7 @@ import json
 
 from tests.workflow.conftest import Project
 
-NAMES = ("hierarchy.html", "ablation.html", "panel.webp", "registration.webp", "fit.webp", "comparison.webp")
+NAMES = ("hierarchy.html", "waymo.html", "panel.webp", "registration.webp", "fit.webp", "comparison.webp")
 NAMES += ("views.webp", "features.webp", "sweep-theta.png")
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>--><!-- {{ alert(3) }}"
 
