@@ -45,8 +45,8 @@ Option = Callable[[Any], Any]  # an option of a stage's command: a function of t
 
 
 UNCOMPARED = frozenset({"device"})
-"""Settings whose change doesn't rerun a stage: devices have equal results up to rounding, and a change to the CPU
-must not discard what a card has finished."""
+"""Settings whose change doesn't rerun a stage. Devices have equal results up to rounding, and a change to the
+CPU must not discard what a card has finished."""
 
 LINKING = ("contributions", "coverage_tree", "semantic_tree")
 """Artifacts that relate masks to each other and to Gaussians."""
