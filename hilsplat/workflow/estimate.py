@@ -121,7 +121,7 @@ def forecasts(plan: Plan, cores: int) -> list[str]:
         is_new = row.features is None and not Path(plan.path(row, "default", "clip")).exists()
         if row.group == PHOTOS and full and is_new:
             lines.append(_forecast(plan, resources, row, cores))
-    return lines
+    return [*lines, NOTES[1]] if any("the GPU" in line for line in lines) else lines
 
 
 def _forecast(plan: Plan, resources: JobResources, row: SceneRow, cores: int) -> str:
@@ -174,5 +174,4 @@ def _forecast(plan: Plan, resources: JobResources, row: SceneRow, cores: int) ->
         f"{row.name}: {first_answer}all photographs in {duration(total_s)}. "
         f"SAM takes {photo_s(row):.1f} s per photograph on {'the GPU' if sam_on_card else core}, "
         f"and CLIP {crop_s:.2g} s per crop on {'the GPU' if clip_on_card else core}."
-        + (f" {NOTES[1]}" if fit_on_card or sam_on_card or clip_on_card else "")
     )

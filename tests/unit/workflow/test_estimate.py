@@ -143,9 +143,9 @@ def test_jobs_on_a_card_are_predicted_without_measuring_the_cpu(photographs, mon
     monkeypatch.setattr(
         estimate.JobResources, "core_seconds", lambda self, rule, job: 75.0 if rule != "gaussians" else 1e6
     )
-    (line,) = estimate.forecasts(found, 1)
+    line, note = estimate.forecasts(found, 1)
     assert words in line and "SAM takes 60.0 s per photograph on the GPU, and CLIP 0.3 s per crop" in line
-    assert "estimated, not measured" in line
+    assert "estimated, not measured" in note
 
 
 def test_without_key_views_there_is_one_time(photographs):
