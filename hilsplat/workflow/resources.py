@@ -232,7 +232,8 @@ class JobResources:
     def candidates(self, rule: str, job: Job) -> tuple[Any, ...] | None:
         """Return what the candidates of a job's SAM depend on, or None; jobs of a scene share cached ones."""
         stages, row = self.plan.stages(job), self.plan.row(job)
-        if cost_name(rule) != "masks" or _is_imported("masks", row) or not self._uses_network("masks", stages):
+        rule = cost_name(rule)
+        if rule != "masks" or _is_imported(rule, row) or not self._uses_network(rule, stages):
             return None
         return row.name, *(getattr(stages.masks, name) for name in CANDIDATES)
 
@@ -294,7 +295,7 @@ class JobResources:
 
 
 def _is_imported(rule: str, row: SceneRow) -> bool:
-    """Return whether a user's files replace the Gaussians, masks or CLIP vectors that a rule would compute."""
+    """Return whether a user's files replace Gaussians, masks or CLIP vectors that a rule would compute."""
     return row.gaussians is not None if rule == "gaussians" else rule in EMBEDDED_S and bool(row.features)
 
 

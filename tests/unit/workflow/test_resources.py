@@ -210,8 +210,12 @@ def test_masks_of_a_data_set_count_as_queries(tmp_path):
 def test_imported_gaussians_masks_and_vectors_cost_neither_a_fit_nor_a_model(tmp_path, monkeypatch):
     """The full-size models would take hours for 40 views."""
     monkeypatch.setenv("HILSPLAT_MODELS", str(tmp_path / "none"))
-    models = {"masks": {"segmenter": "sam", "model": "models/sam-vit-huge"}, "clip": {"model": "models/clip-vit-b-16-laion2b"}}
-    found = JobResources(plan(tmp_path, world={"views": 40, "image_px": 512}, **models), cores=2)
+    sections = {
+        "masks": {"segmenter": "sam", "model": "models/sam-vit-huge"},
+        "clip": {"model": "models/clip-vit-b-16-laion2b"},
+        "world": {"views": 40, "image_px": 512},
+    }
+    found = JobResources(plan(tmp_path, **sections), cores=2)
     (row,), computed = found.plan.rows, {}
     for rule in ("gaussians", "masks", "clip"):
         card_s = found.card_seconds(rule, JOB)
