@@ -140,13 +140,20 @@ def remembered(kind: str, key: object, examine: Callable[[], str]) -> str:
         kind: name of a folder of results, which `forget` clears.
         key: JSON value that changes if the result may change, such as versions of libraries.
     """
-    path = _folder(kind) / sha256_of_json(key)
-    with suppress(OSError, ValueError):
-        return path.read_text(encoding="utf-8")
+    known = recalled(kind, key)
+    if known is not None:
+        return known
     result = examine()
     with suppress(OSError, HilsplatError):
-        write_text(path, result)
+        write_text(_folder(kind) / sha256_of_json(key), result)
     return result
+
+
+def recalled(kind: str, key: object) -> str | None:
+    """Return the earlier result of `remembered`, or None."""
+    with suppress(OSError, ValueError):
+        return (_folder(kind) / sha256_of_json(key)).read_text(encoding="utf-8")
+    return None
 
 
 def forget(kind: str) -> None:

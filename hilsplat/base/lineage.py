@@ -9,6 +9,7 @@ import subprocess
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -192,6 +193,10 @@ class Inputs:
         return {"path": os.path.commonpath(digests) if digests else "", "files": digests}
 
 
+RASTERISER: ContextVar[str | None] = ContextVar("RASTERISER", default=None)
+"""Device that the running stage has chosen for rasterising, for its provenance record."""
+
+
 def write_provenance(
     artifact: Path,
     *,
@@ -203,7 +208,6 @@ def write_provenance(
     inputs: Inputs,
     beside: Sequence[Path] = (),
     plugins: Sequence[str] = (),
-    device: str | None = None,
 ) -> None:
     """Write an artifact's provenance record: command, settings, inputs, software, and digests of outputs."""
     folder = Path(artifact).parent
@@ -215,7 +219,7 @@ def write_provenance(
         "plugins": list(plugins),
         "settings": dict(settings),
         "seed": seed,
-        "device": device,
+        "device": RASTERISER.get(),
         "inputs": inputs.records,
         "outputs": {
             os.path.relpath(path, folder): {"sha256": sha256_of_path(path), "bytes": sizes_of(path)}

@@ -30,7 +30,7 @@ from hilsplat.models.store import model_digest
 from hilsplat.stage import Stage
 from hilsplat.stages import all_stages
 from hilsplat.workflow import targets
-from hilsplat.workflow.plan import Plan, words_of
+from hilsplat.workflow.plan import UNCOMPARED, Plan, words_of
 from hilsplat.workflow.scene_data import VariantJob, of_variant
 
 WHOLE, STALE, DAMAGED = "whole", "stale", "damaged"
@@ -148,9 +148,11 @@ class Records:
             if kind != stage.name:
                 yield f"it was made by stage {stage.name}, not {kind}"
             for section in stage.sections.values():
-                now = json.loads(self.plan.settings(section, job))
-                if record.settings.get(section) != now:
-                    yield f"it was made with {section} {record.settings.get(section)!r}, not {now!r}"
+                now = json.loads(self.plan.settings(section, job, UNCOMPARED))
+                made = dict(record.settings.get(section, {}))
+                made = {name: value for name, value in made.items() if name not in UNCOMPARED}
+                if made != now:
+                    yield f"it was made with {section} {made!r}, not {now!r}"
             seed = self.plan.seed(stage, job) if "seed" in stage.hints else None
             if record.seed != seed:
                 yield f"it was made with seed {record.seed}, not {seed}"

@@ -16,7 +16,7 @@ from hilsplat.settings import MasksSettings
 from hilsplat.stages import stage_of
 from hilsplat.workflow import targets
 from hilsplat.workflow.models import models_of_photographs, settings_of_photographs
-from hilsplat.workflow.plan import Plan, any_of, without_scene
+from hilsplat.workflow.plan import UNCOMPARED, Plan, any_of, without_scene
 from tests.conftest import PROJECT
 from tests.unit.models.test_store import write_model
 from tests.unit.workflow.plans import BENCHMARK, Job, plan_of, write_sheet
@@ -163,7 +163,7 @@ def test_imported_masks_get_the_levels_of_the_variant_and_need_no_model(tmp_path
     assert [(each.levels, each.uses_model) for each in levels] == [("head", False), ("tree", False)]
     assert levels[1].theta == 0.7
     values = found.params("imported_masks")["settings"](jobs[1])
-    assert found.settings("masks", jobs[1]) in values  # as `workflow.records` expects
+    assert found.settings("masks", jobs[1], UNCOMPARED) in values  # as `workflow.records` expects
     first, other = (found.identity("clip", variant, (), True) for variant in ("default", "tree"))
     assert first != other and first.stages == other.stages == ("imported_clip", "imported_masks")
 
@@ -194,6 +194,18 @@ def test_the_folder_of_data_sets_counts_for_scenes_that_read_it(tmp_path):
         for job, is_read in ((Job(), False), (Job("photos", "desk"), True)):
             here, moved = (each.params(name)["settings"](job) for each in plans)
             assert (here == moved) is not is_read and ("--data-root" in here) is is_read
+
+
+@pytest.mark.parametrize("stage", ["gaussians", "masks", "clip", "contributions"])
+def test_another_device_changes_the_command_but_reruns_nothing(tmp_path, stage):
+    files, outputs = SimpleNamespace(), SimpleNamespace(out="results/synthetic/one/default/x", report="r")
+    by_device = [plan(tmp_path, **{stage: {"device": device}}).params(stage) for device in ("auto", "cpu")]
+    commands = [params["command"](Job(), files, outputs) for params in by_device]
+    assert ['"device":"auto"' in command for command in commands] == [True, False]
+    assert '"device":"cpu"' in commands[1]
+    for name in ("settings", "code"):
+        auto, cpu = (params[name](Job()) for params in by_device)
+        assert auto == cpu
 
 
 @pytest.mark.parametrize(
