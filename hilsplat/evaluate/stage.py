@@ -206,7 +206,7 @@ def time_queries(
     rule = rule_of(settings)
 
     def by_field(text: str) -> object:
-        relevancy = answers.field.relevancy([text], view)[0]
+        relevancy = answers.field.relevancy([text], view, exact=False)[0]
         return relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
 
     def by_tree(text: str) -> object:

@@ -315,11 +315,14 @@ def test_while_a_scene_is_rebuilt_new_parts_precede_those_of_the_previous_run(tm
     assert used() == ("default", True)
 
 
-def test_the_field_answers_through_the_same_interface(scene):
+def test_the_field_answers_through_the_same_interface_and_by_look_ups(scene):
     hits = scene.query("B", "whole", answerer="field")
     assert hits[0].node == NODE["B"]
     (hit,) = scene.query("A > A top", answerer="field")
     assert (hit.node, hit.route) == (NODE["A top"], "child")
+    exact = scene.field.relevancy(["B", "A top"], "004.png")
+    fast = scene.field.relevancy(["B", "A top"], "004.png", exact=False)
+    assert fast == pytest.approx(exact, abs=2e-3)  # a network with d = 4: decoded as well
 
 
 @pytest.mark.parametrize(
