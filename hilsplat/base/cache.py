@@ -28,6 +28,8 @@ CHECKPOINTS = "gaussians"  # cache of fit checkpoints; in the others, a missing 
 CACHES = (CHECKPOINTS, "masks", "contributions", "clip", "texts", "int8")
 """Folders of entries that may be deleted."""
 
+PROBLEM_S = 3600.0  # how long a problem found by an examination counts
+
 FIT_DAYS = 1.0
 """Checkpoints younger than this are kept, because fits save more often and may still be running."""
 
@@ -150,9 +152,16 @@ def remembered(kind: str, key: object, examine: Callable[[], str]) -> str:
 
 
 def recalled(kind: str, key: object) -> str | None:
-    """Return the earlier result of `remembered`, or None."""
+    """Return the earlier result of `remembered`, or None.
+
+    A problem, a result that is not empty, counts for an hour: memory, a time limit or another job may be its
+    cause.
+    """
     with suppress(OSError, ValueError):
-        return (_folder(kind) / sha256_of_json(key)).read_text(encoding="utf-8")
+        path = _folder(kind) / sha256_of_json(key)
+        result = path.read_text(encoding="utf-8")
+        if not result or time.time() - path.stat().st_mtime < PROBLEM_S:
+            return result
     return None
 
 

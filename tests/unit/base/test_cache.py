@@ -13,7 +13,7 @@ import pytest
 
 from hilsplat.base.artifacts import read_npz, write_arrays
 from hilsplat.base.atomic import atomic_path
-from hilsplat.base.cache import CACHES, ViewCache, prune_cache, size_table
+from hilsplat.base.cache import CACHES, ViewCache, prune_cache, remembered, size_table
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.processes import host_token
@@ -42,6 +42,22 @@ def cache(tmp_path) -> Path:
 
 def left(cache: Path) -> list[str]:
     return sorted(path.relative_to(cache).as_posix() for path in cache.rglob("*.npz"))
+
+
+@pytest.mark.parametrize(("problem", "examined"), [("", 1), ("the build was killed", 2)])
+def test_a_problem_of_this_machine_is_examined_again_after_an_hour(tmp_path, monkeypatch, problem, examined):
+    monkeypatch.setattr("hilsplat.base.cache._folder", lambda kind: tmp_path / kind)
+    times = []
+
+    def examine() -> str:
+        times.append(1)
+        return problem
+
+    for age_s in (0, 60, 3660, 0):
+        assert remembered("cuda", "build", examine) == problem
+        (result,) = (tmp_path / "cuda").iterdir()
+        os.utime(result, (time.time() - age_s,) * 2)
+    assert len(times) == examined
 
 
 def test_the_table_names_each_cache(cache):
