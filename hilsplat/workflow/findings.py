@@ -117,7 +117,14 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
         _name_unused([*models, *below], "to use these poses, pass --poses", parts)
         unread = [path for pattern in UNREAD_POSES for path in folder.glob(pattern)]
         _name_unused(unread, "for poses, export a COLMAP model or transforms.json", parts)
-        photos = list_images(layouts.photo_folder(folder))
+        photos = list_images(chosen := layouts.photo_folder(folder))
+        others = [
+            path for path in layouts.largest_copies(layouts.used_images(folder)) if path.parent != chosen
+        ]
+        if counts := layouts.counted_by_folder(others):
+            parts.lines.append(f"  not used: {shorten_list(counts, 5)}; to use them, move them to {chosen}")
+        if away := layouts.placeholders(chosen):
+            parts.lines.append(f"  left out: {len(away)} photographs that {layouts.NOT_DOWNLOADED}")
         return Views(dict(zip(view_names(photos), photos, strict=True)))
     source, views, max_side_px = read_source(known), Views(), settings.poses.max_side_px
     with_image = {view.image: view for view in source.views if view.image is not None}

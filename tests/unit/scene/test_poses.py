@@ -131,6 +131,9 @@ def test_views_are_named_after_files_and_collisions_are_refused(tmp_path):
     assert view_names(twice) == ["train_r_0.png", "test_r_0.png"]
     with pytest.raises(SceneError, match=r"same view name 1\.png"):
         view_names([tmp_path / "1.jpg", tmp_path / "1.png"])
+    pairs = [tmp_path / f"IMG_{row}{suffix}" for row in range(9) for suffix in (".heic", ".jpg")]
+    with pytest.raises(SceneError, match=r"same view name IMG_0\.png, and so on for 9 names"):
+        view_names(pairs)
     with pytest.raises(SceneError, match="brace"):
         view_names([tmp_path / "a{1}.png"])
 
