@@ -26,7 +26,7 @@ from hilsplat.base.artifacts import (
     write_json,
 )
 from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, foreign
-from hilsplat.base.files import files_below, regular, stats_of
+from hilsplat.base.files import files_below, regular
 
 CONVERTED = ".made_from.json"
 """Hidden file in a folder of extracted frames or unpacked photographs that records their source."""
@@ -67,12 +67,13 @@ def copies_of(paths: Iterable[Path]) -> dict[Path, Path]:
     Only files of equal size are read. Empty and unreadable files have no copies.
     """
     by_size: dict[int, list[Path]] = defaultdict(list)
-    for path, stat in stats_of(paths).items():
-        by_size[stat.st_size].append(path)
+    for path in paths:
+        with suppress(OSError):  # reported where the file is used
+            by_size[path.stat().st_size].append(path)
     copies, originals = {}, dict[str, Path]()
     for size, same in by_size.items():
         for path in sorted(same, key=lambda path: (len(path.name), path)) if size and len(same) > 1 else ():
-            with suppress(OSError):  # reported where the file is used
+            with suppress(OSError):
                 if (original := originals.setdefault(sha256_of_file(path), path)) != path:
                     copies[path] = original
     return copies

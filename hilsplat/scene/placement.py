@@ -17,9 +17,8 @@ SHAPE_TOLERANCE = 0.01
 OUTSIDE = -1
 
 ON_VIEW = {"drawn_on": "view"}
-"""Key in files that state an image's size, if the image was the view. The size alone can't tell it from the
-photograph once the lens has been estimated again: the view's size then changes by about a pixel.
-"""
+"""Key of files whose drawings are on the view. Their size can fit the photograph better once the lens has
+been estimated again, because the view's size then changes by about a pixel."""
 
 Placement = Callable[[Shaped[np.ndarray, "H W"]], Shaped[np.ndarray, "h w"]]
 

@@ -96,7 +96,7 @@ def _state_of(part: Path) -> tuple[int, int] | None:
         file = (part / INDEX if part.is_dir() else part).stat()
     except OSError:
         return None
-    return file.st_size, file.st_mtime_ns  # exFAT numbers an inode anew whenever it is loaded
+    return file.st_size, file.st_mtime_ns  # on exFAT, a file can get another inode number
 
 
 Shown = TypeVar("Shown", bound=ShownScene)

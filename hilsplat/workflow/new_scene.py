@@ -180,10 +180,12 @@ def _with_row(sheet: Path, name: str, photos: Path, columns: dict[str, Path]) ->
             if "".join(cells.values()).isprintable() and all(
                 getattr(read, column) in (path, path.resolve()) for column, path in meant.items()
             ):
-                SceneData([read], "", str).require_usable_files(read)
-                return text
-    raise SceneError(
-        f"a path of {name} cannot be written to the scene sheet",
-        found=", ".join(map(repr, cells.values())),
-        fix="rename the folder or file",
-    )
+                break
+    else:
+        raise SceneError(
+            f"a path of {name} cannot be written to the scene sheet",
+            found=", ".join(map(repr, cells.values())),
+            fix="rename the folder or file",
+        )
+    SceneData([read], "", str).require_usable_files(read)
+    return text

@@ -246,6 +246,7 @@ def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
     assert report.passed_over == {".nef": 1, ".rw2": 1}
     assert "5 photographs in" in str(report) and "4  of 40 x 30 px" in str(report)
     assert "1  are copies of others and are left out: 1.jpg = copy.jpg" in str(report)
+    assert "1  are copies of others: 1.jpg" in str(replace(report, have_poses=True))  # all are used
     many = str(replace(report, duplicates=(("a.jpg", "b.jpg", "c.jpg"),) * 8))
     assert "16  are copies of others" in many and many.count("a.jpg = b.jpg = c.jpg") == 5
 

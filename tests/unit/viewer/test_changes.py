@@ -52,7 +52,7 @@ def test_a_rewritten_part_is_reported_until_a_reload(page, own_desk):
 
 
 def test_another_inode_of_the_same_file_is_no_change(page, own_desk):
-    """The kernel numbers the files of exFAT anew whenever it loads them."""
+    """On exFAT, the kernel assigns inode numbers whenever it loads a file."""
     shutil.copy2(own_desk / "gaussians.ply", own_desk / "other")
     (own_desk / "other").replace(own_desk / "gaussians.ply")
     assert news(page)["changed"] == [] and load(page) == page.state
