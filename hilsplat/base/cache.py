@@ -1,5 +1,6 @@
 """Caches: finished views and checkpoints, their sizes and pruning, and examinations of this machine."""
 
+import getpass
 import logging
 import os
 import re
@@ -139,13 +140,20 @@ def remembered(kind: str, key: object, examine: Callable[[], str]) -> str:
         kind: name of a folder of results, which `forget` clears.
         key: JSON value that changes if the result may change, such as versions of libraries.
     """
-    path = _folder(kind) / sha256_of_json(key)
-    with suppress(OSError, ValueError):
-        return path.read_text(encoding="utf-8")
+    known = recalled(kind, key)
+    if known is not None:
+        return known
     result = examine()
     with suppress(OSError, HilsplatError):
-        write_text(path, result)
+        write_text(_folder(kind) / sha256_of_json(key), result)
     return result
+
+
+def recalled(kind: str, key: object) -> str | None:
+    """Return the earlier result of `remembered`, or None."""
+    with suppress(OSError, ValueError):
+        return (_folder(kind) / sha256_of_json(key)).read_text(encoding="utf-8")
+    return None
 
 
 def forget(kind: str) -> None:
@@ -160,6 +168,10 @@ def use_writable_cache() -> None:
 
     They would fail otherwise: numba, Snakemake and Matplotlib, in containers without a home.
     """
+    try:
+        getpass.getuser()
+    except (KeyError, OSError):  # a user without a name; Snakemake prints it
+        os.environ["LOGNAME"] = str(os.getuid())
     wanted = Path("~/.cache")
     with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
         wanted = platformdirs.user_cache_path()
@@ -174,7 +186,6 @@ def use_writable_cache() -> None:
         folder = Path(tempfile.mkdtemp(prefix="hilsplat-"))
     os.environ["XDG_CACHE_HOME"] = os.environ["MPLCONFIGDIR"] = str(folder)
     os.environ.setdefault("HOME", str(folder))
-    os.environ.setdefault("LOGNAME", str(os.getuid()))  # a user without a name
     logger.info("%s cannot be written; caches are kept in %s", wanted, folder)
 
 

@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -90,8 +91,11 @@ def sha256_of_path(path: Path) -> str:
     return sha256_of_json([(file.relative_to(path).as_posix(), sha256_of_file(file)) for file in files])
 
 
+UNREADABLE = "unreadable"
+
+
 def digests_of(paths: Collection[str], memo: Path) -> dict[str, str]:
-    """Map each path to its file's SHA-256, or "unreadable"; only files that changed since `memo` are read.
+    """Map each path to its file's SHA-256, or `UNREADABLE`; only files that changed since `memo` are read.
 
     Programs cannot set the status change time, so it reveals a replacement of the same size and time.
     """
@@ -115,7 +119,7 @@ def digests_of(paths: Collection[str], memo: Path) -> dict[str, str]:
             list(threads.map(read, changed))
         with suppress(OSError, HilsplatError):  # a read-only folder of results, or a full disk
             write_json(memo, old | entries)
-    return {path: entries.get(path, "unreadable").split()[-1] for path in paths}
+    return {path: entries.get(path, UNREADABLE).split()[-1] for path in paths}
 
 
 def visible_files(folder: Path) -> list[Path]:
@@ -208,6 +212,10 @@ class Inputs:
         return {"path": os.path.commonpath(digests) if digests else "", "files": digests}
 
 
+RASTERISER: ContextVar[str | None] = ContextVar("RASTERISER", default=None)
+"""Device that the running stage has chosen for rasterising, for its provenance record."""
+
+
 def write_provenance(
     artifact: Path,
     *,
@@ -219,7 +227,6 @@ def write_provenance(
     inputs: Inputs,
     beside: Sequence[Path] = (),
     plugins: Sequence[str] = (),
-    device: str | None = None,
 ) -> None:
     """Write an artifact's provenance record: command, settings, inputs, software, and digests of outputs."""
     folder = Path(artifact).parent
@@ -231,7 +238,7 @@ def write_provenance(
         "plugins": list(plugins),
         "settings": dict(settings),
         "seed": seed,
-        "device": device,
+        "device": RASTERISER.get(),
         "inputs": inputs.records,
         "outputs": {
             os.path.relpath(path, folder): {"sha256": sha256_of_path(path), "bytes": sizes_of(path)}

@@ -130,6 +130,10 @@ class LabelledScene:
     def num_pairs(self) -> int:
         return sum(len({region.text for region in regions}) for regions in self.views.values())
 
+    def image_hw(self, view: str) -> tuple[int, int] | None:
+        """Return the size of a view's image in the data set; None if the data set has no image of it."""
+        return image_size_hw(self.images[view]) if view in self.images else None
+
     def check_posed(self, names: Collection[str]) -> list[str]:
         """Return the labelled views that have a pose; log the others.
 

@@ -27,7 +27,7 @@ from hilsplat.base.images import (
     resize_to_fit,
 )
 from hilsplat.base.lineage import copies_of
-from hilsplat.base.processes import in_order
+from hilsplat.base.processes import in_order, num_cores
 from hilsplat.base.progress import track
 from hilsplat.scene.features import exif_focal_px
 from hilsplat.scene.layouts import photo_folder
@@ -177,7 +177,7 @@ def inspect_photos(folder: Path, posed: Sequence[Path] = ()) -> PhotoReport:
         is_matched = row in matched and not have_poses
         return checked_photo(name, pixels, focal_px, is_matched=is_matched), is_turned
 
-    reads = in_order(inspected, range(len(photos)), num_readers(photos, os.cpu_count() or 1))
+    reads = in_order(inspected, range(len(photos)), num_readers(photos, num_cores()))
     for path, found in zip(photos, track(reads, "photographs checked", len(photos)), strict=True):
         if isinstance(found, str):
             unreadable.append((path.relative_to(folder).as_posix(), found))

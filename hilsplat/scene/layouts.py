@@ -364,7 +364,10 @@ def photo_files(folder: Path, named: Path | None = None) -> list[Path]:
     """Return the files in a source folder that `poses` reads: photographs, and the files of known poses.
 
     Poses may refer to any image below the folder. Folders that hilsplat wrote and `UNUSED` ones are skipped.
+    A missing folder, as of a disk that isn't connected, has none.
     """
+    if not folder.is_dir():
+        return []
     try:
         known = find_known_poses(folder, named)
     except SceneError:  # `poses` reports it

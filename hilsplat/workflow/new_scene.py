@@ -120,7 +120,7 @@ def _labels_to_copy(annotated: Path, parts: Parts) -> dict[Path, str]:
 
 
 def _require_new(sheet: Path, name: str) -> None:
-    for row in read_sheet(sheet, checked_groups=()) if sheet.exists() else []:
+    for row in read_sheet(sheet, ()) if sheet.exists() else []:
         if row.name.casefold() == f"{PHOTOS}/{name}".casefold():
             raise SceneError(
                 f"scene {row.name} is already in {sheet}",
