@@ -6,7 +6,8 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Collection, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from contextvars import ContextVar
@@ -59,6 +60,24 @@ def sha256_of_file(path: Path) -> str:
     except OSError as error:
         error.filename = str(path)  # errors of reading name no file
         raise
+
+
+def copies_of(paths: Iterable[Path]) -> dict[Path, Path]:
+    """Map each copy of another file to that file; of files with the same bytes, the shortest name is kept.
+
+    Only files of equal size are read. Empty and unreadable files have no copies.
+    """
+    by_size: dict[int, list[Path]] = defaultdict(list)
+    for path in paths:
+        with suppress(OSError):  # reported where the file is used
+            by_size[path.stat().st_size].append(path)
+    copies, originals = {}, dict[str, Path]()
+    for size, same in by_size.items():
+        for path in sorted(same, key=lambda path: (len(path.name), path)) if size and len(same) > 1 else ():
+            with suppress(OSError):
+                if (original := originals.setdefault(sha256_of_file(path), path)) != path:
+                    copies[path] = original
+    return copies
 
 
 def sha256_of_path(path: Path) -> str:

@@ -121,6 +121,13 @@ class SceneData:
         """Return the memo of the digests of a scene's files outside the results (`digests_of`)."""
         return Path(self.path(job)).parents[1] / ".cache/inputs" / job.dataset / f"{job.scene}.json"
 
+    def require_usable_files(self, row: SceneRow) -> None:
+        """Raise HilsplatError for files of a user that would stop a run: by their names or times."""
+        self.require_no_braces(row)
+        photographs = self.image_files(row) if row.folder is not None else []
+        photographs = [] if isinstance(photographs, str) else photographs
+        _require_past([*photographs, *self.gaussians_files(row), *self.features(row), *self.label_files(row)])
+
     def require_no_braces(self, row: SceneRow) -> None:
         """Raise SettingsError for file names with braces, which Snakemake interprets as wildcards."""
         files = self.image_files(row) if row.folder is not None else []

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilsplat.base.errors import ArtifactError, SettingsError
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS, Level, spelt
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.code import LanguageField, load_code
 from hilsplat.field.field import run_field
@@ -356,6 +356,17 @@ def test_answers_in_a_view_are_nodes_that_it_shows(scene, text):
     assert dark.query(text, view="000.png") == []
     with pytest.raises(SettingsError, match="has no view 'x'"):
         scene.query(text, view="x")
+
+
+def test_views_are_found_however_their_names_are_composed(scene):
+    """macOS decomposes names of files, and keyboards type composed letters."""
+    stored, typed = "Gro\u0308ße.png", "Gr\u00f6ße.png"
+    cameras = replace(scene.scene.cameras, names=(stored, *scene.scene.cameras.names[1:]))
+    views = replace(scene.views, scene=replace(scene.scene, cameras=cameras))
+    assert cameras[typed].name == views.camera(typed).name == stored
+    assert spelt("000.png", cameras.names) is None
+    with pytest.raises(ArtifactError, match=stored):  # not the name that was typed
+        views.image(typed)
 
 
 def test_a_view_shows_the_nodes_with_a_mask_there(scene, monkeypatch):
