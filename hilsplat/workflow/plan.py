@@ -178,7 +178,7 @@ class Plan:
         self._unlisted = {f"{path.parent.name}/{path.name}" for path in inside} - names
         self._first_alike = functools.cache(self._first_with_equal_identity)
         for row in self.scenes:
-            self.data.require_no_braces(row)
+            self.data.require_usable_files(row)
 
     def absent_lines(self) -> list[str]:
         """Return a line for each data set with skipped scenes, or for each reason if there are several."""
