@@ -42,10 +42,13 @@ report: "workflow/report/overview.rst"
 LOCK = prepare_process()
 
 
-try:
-    CORES = workflow.cores  # of this machine, if it runs the jobs
-except WorkflowError:  # on a cluster, --jobs applies instead
+try:  # cores of this machine, if it runs the jobs; on a cluster, also on its nodes, they decide nothing
+    CORES = None if workflow.nodes or workflow.remote_exec else workflow.cores
+except WorkflowError:
     CORES = None
+# The jobs of a group run one after the other, also on its node (profiles/slurm).
+if workflow.remote_exec:
+    workflow.register_resource("place", 1)
 if CORES == 0:
     raise WorkflowError("with --cores 0, no job can start; expected at least 1")
 try:
@@ -130,7 +133,7 @@ onstart:
     except HilsplatError as error:  # another run writes to the same results
         raise WorkflowError(str(error)) from None
     record_run(
-        PLAN.results,
+        PLAN,
         workflow.config_settings.configfiles,
         workflow.config_settings.config,
     )

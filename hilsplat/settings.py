@@ -152,11 +152,6 @@ class GaussiansSettings(Section):
         "auto", "cuda: gsplat and torch; auto: cuda if it works and the card has enough free memory, else cpu"
     )
 
-    @property
-    def rasteriser(self) -> Device:
-        """Value of `device`."""
-        return self.device
-
 
 class MasksSettings(Section):
     """Masks of each view, at three levels."""

@@ -21,10 +21,9 @@ import typer
 from hilsplat.base.artifacts import provenance_path
 from hilsplat.base.atomic import output_lock, require_free_space, was_interrupted
 from hilsplat.base.cache import writable
-from hilsplat.base.cards import take_card
 from hilsplat.base.code import code_digest, imports_of, modules_of, statements_of
 from hilsplat.base.errors import HilsplatError
-from hilsplat.base.lineage import Inputs, write_provenance
+from hilsplat.base.lineage import RASTERISER, Inputs, write_provenance
 from hilsplat.base.ownership import require_replaceable
 from hilsplat.base.removal import delete
 from hilsplat.configuration import SECTIONS, StageSettings
@@ -236,12 +235,8 @@ def _recorded(stage: Stage[..., Any], arguments: Mapping[str, Any]) -> Iterator[
     paths = [path for value in inputs.values() for path in ([value] if isinstance(value, Path) else value)]
     require_replaceable((out, *beside, *new), stage.name, paths)
     require_free_space(out.parent, MIN_FREE_MIB)
-    device = next(
-        (section.rasteriser for section in sections.values() if hasattr(section, "rasteriser")), None
-    )
     with output_lock(out, *beside, *new):
-        if any(section.uses_card for section in sections.values()):
-            take_card()
+        RASTERISER.set(None)
         before, code = Inputs(stage.name, inputs), stage.code_digest(extra.plugins)
         yield
         try:
@@ -259,14 +254,7 @@ def _recorded(stage: Stage[..., Any], arguments: Mapping[str, Any]) -> Iterator[
             inputs=before,
             beside=(*beside, *filter(Path.exists, side_files)),
             plugins=extra.plugins,
-            device=None if device is None else _chosen(device),
         )
-
-
-def _chosen(setting: Literal["auto", "cpu", "cuda"]) -> str:
-    from hilsplat.splat.rasterise.device import choose_device  # lazy: most stages don't rasterise
-
-    return choose_device(setting)
 
 
 def _command() -> list[str]:

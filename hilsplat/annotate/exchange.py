@@ -33,7 +33,7 @@ from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.images import isat
 from hilsplat.datasets.images.hi import PROPOSED
 from hilsplat.scene.cameras import Camera, Cameras
-from hilsplat.scene.placement import placed, placement
+from hilsplat.scene.placement import ON_VIEW, is_on_view, of_view, placed, placement
 from hilsplat.scene.scene import Scene
 from hilsplat.scene.view_names import match_names
 from hilsplat.web.coco import coco_content, coco_region
@@ -123,7 +123,7 @@ def labels_of_truth(truth: HierarchyAnnotations, views: Sequence[str]) -> dict[s
 
 def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
     """Format labels as ISAT, one polygon per entry; all pieces of a labelled object have the same group."""
-    size = {"width": size_hw[1], "height": size_hw[0]}
+    size = {"width": size_hw[1], "height": size_hw[0], **ON_VIEW}
     name = f"{Path(view).stem}.jpg"  # LangSplat's evaluation reads the number before ".jpg"
     info = {"description": "ISAT", "folder": "", "name": name, **size, "depth": 3, "note": ""}
     objects = []
@@ -149,7 +149,8 @@ def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> st
     for label in labels:
         keys = {"group_id": label.id, "shape_type": "polygon", "flags": {}, **label.model_dump(include=OURS)}
         shapes += [{"label": label.text, "points": ring, **keys} for ring in label.polygons]
-    image = {"imagePath": view, "imageData": None, "imageHeight": size_hw[0], "imageWidth": size_hw[1]}
+    size = {"imageHeight": size_hw[0], "imageWidth": size_hw[1], **ON_VIEW}
+    image = {"imagePath": view, "imageData": None, **size}
     return json.dumps({"version": "5.5.0", "flags": {}, "shapes": shapes, **image}, ensure_ascii=False)
 
 
@@ -157,6 +158,7 @@ def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, A
     """Format labels as COCO, with run lengths because COCO fills polygons differently."""
     texts = sorted({label.text for labels in known.values() for label in labels})
     content = coco_content("annotations by hilsplat", known, cameras, texts)
+    content["images"] = [{**image, **ON_VIEW} for image in content["images"]]
     for number, (view, labels) in enumerate(known.items()):
         for label in labels:
             described = {
@@ -289,6 +291,7 @@ Reader = Callable[[str, Any], Piece | str]
 def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos: Photos) -> Reader:
     drawn_hw = isat.stated_size(name, content.get("info"))
     view = _view(name, content["info"].get("name"), cameras, photos)
+    camera = _drawn_camera(content["info"], cameras[view])
     things: list[isat.IsatObject] = []
     for entry in content["objects"]:
         with suppress(HilsplatError), foreign(name):  # `read` reports it
@@ -300,7 +303,7 @@ def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos
             return f"of the background ({isat.BACKGROUND}), cut out of the regions below them"
         # Without our keys, groups are ignored: in LERF-OVS's files, group numbers are not unique.
         number = entry.get("id", entry.get("group") if "level" in entry else None)
-        rings = placed_rings(thing.polygons, drawn_hw, cameras[view], where)
+        rings = placed_rings(thing.polygons, drawn_hw, camera, where)
         return Piece(view, thing.category, number, rings, entry)
 
     return read
@@ -308,6 +311,7 @@ def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos
 
 def _labelme_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos: Photos) -> Reader:
     view = _view(name, content.get("imagePath"), cameras, photos)
+    camera = _drawn_camera(content, cameras[view])
     size: Mapping[str, Any] = {side: content.get(f"image{side.title()}") for side in ("height", "width")}
     if not any(size.values()) and content.get("imageData"):  # as in old versions
         with open_image(io.BytesIO(base64.b64decode(content["imageData"]))) as image:
@@ -316,16 +320,16 @@ def _labelme_reader(name: str, content: Mapping[str, Any], cameras: Cameras, pho
         size = _photo_size(photos, view)
 
     def read(where: str, entry: Any) -> Piece | str:
-        drawn_hw = _drawn_hw(where, size, cameras[view])
+        drawn_hw = _drawn_hw(where, size, camera)
         kind, text = entry.get("shape_type") or "polygon", entry["label"]
         if kind in NO_AREA:
             return "without an area (points, lines)"
         points = _vertices(entry["points"], drawn_hw)
         if kind == "polygon" and "level" in entry:  # exported by us
-            rings = placed_rings([points], drawn_hw, cameras[view], where)
+            rings = placed_rings([points], drawn_hw, camera, where)
         else:
             mask = _labelme_mask(f"{where} ({text})", kind, points, entry.get("mask"), drawn_hw)
-            rings = traced(placed(mask, cameras[view], where))
+            rings = traced(placed(mask, camera, where))
         return Piece(view, text, entry.get("group_id"), rings, entry)
 
     return read
@@ -379,8 +383,9 @@ def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos
             return "without a region (boxes, keypoints)"
         if image.get("height") is image.get("width") is None:
             image = _photo_size(photos, view)
-        mask = _coco_mask(where, region, image, cameras[view])
-        return Piece(view, str(text), entry.get("thing"), traced(placed(mask, cameras[view], where)), entry)
+        camera = _drawn_camera(image, cameras[view])
+        mask = _coco_mask(where, region, image, camera)
+        return Piece(view, str(text), entry.get("thing"), traced(placed(mask, camera, where)), entry)
 
     return read
 
@@ -438,6 +443,10 @@ def _vertices(value: Any, size_hw: tuple[int, int]) -> Float[np.ndarray, "P 2"]:
 def _photo_size(photos: Photos, view: str) -> dict[str, int]:
     """Return the size of a view's photograph, for a file that states none; empty if it is unknown."""
     return dict(zip(("height", "width"), photos.get(view, {}).get("photo_hw_px", ()), strict=False))
+
+
+def _drawn_camera(content: Mapping[str, Any], camera: Camera) -> Camera:
+    return of_view(camera) if is_on_view(content) else camera
 
 
 def _drawn_hw(where: str, image: Mapping[str, Any], camera: Camera) -> tuple[int, int]:

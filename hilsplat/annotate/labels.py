@@ -23,7 +23,7 @@ from hilsplat.datasets.images.hi import by_id, parents_of
 from hilsplat.datasets.images.isat import IsatFile, Polygon, fill_polygons, read_isat, trace_polygons
 from hilsplat.scene.cameras import MAX_SIDE_PX, Camera, Cameras
 from hilsplat.scene.layouts import read_json_object
-from hilsplat.scene.placement import placed
+from hilsplat.scene.placement import ON_VIEW, of_view, placed
 from hilsplat.web.file_changes import replacing, version_of
 from hilsplat.web.messages import Message
 
@@ -189,6 +189,7 @@ def _with_ids(stored: IsatFile, texts: Mapping[int, str]) -> IsatFile:
 def _labels_of(stored: IsatFile, camera: Camera) -> list[Label]:
     objects = by_id(stored)
     parents = parents_of(stored, objects, [])
+    camera = of_view(camera) if stored.on_view else camera
     labels = []
     for number, thing in objects.items():
         polygons = placed_rings(thing.polygons, stored.size_hw, camera, f"label file {stored.path}")
@@ -259,7 +260,7 @@ def as_file(
         keys: more keys of objects, by id.
     """
     more = dict(content or {})
-    info = {**more.pop("info", {}), "name": view, "width": size_hw[1], "height": size_hw[0]}
+    info = {**more.pop("info", {}), "name": view, "width": size_hw[1], "height": size_hw[0], **ON_VIEW}
     objects = [
         {
             "id": label.id,

@@ -30,7 +30,8 @@ OTHER_VERSION = " was written by a different version of hilsplat"
 RECORD = ".provenance.json"
 """Ending of the name of a provenance record, which begins with the artifact's name."""
 
-RUN = ".run.json"  # hidden file in a results folder that records the options of the run that writes to it
+RUN = ".run.json"
+"""Hidden file in a results folder and in each scene's folder, with the options of the last run."""
 
 
 def provenance_path(artifact: Path) -> Path:
@@ -42,13 +43,17 @@ def provenance_path(artifact: Path) -> Path:
 def run_command(path: Path, *options: str, scene: str = "", settings: Mapping[str, Any] | None = None) -> str:
     """Return the command that makes a results file, or all results, in the project that they belong to.
 
-    Given a `scene`, the command makes this scene; `settings` are added to the overrides of the run.
+    Options are those of the last run of the scene that the file belongs to, or else of any scene. Given a
+    `scene`, the command makes this scene; `settings` are added to the overrides of the run.
     """
     path = Path(path).resolve()
     folders = [path, *path.parents]
-    results = next((folder for folder in folders if (folder / RUN).is_file()), None)
-    run = read_memo(results / RUN, dict[str, list[str]]) if results else {}
-    results = results or next((folder for folder in folders if folder.name == "results"), path.parent)
+    marked = (folder for folder in folders if (folder / RUN).is_file() and "scene" not in _run_of(folder))
+    named = (folder for folder in folders if folder.name == "results")
+    results = next(marked, None) or next(named, path.parent)
+    parts = path.relative_to(results).parts
+    place = results.joinpath(*(parts[1:3] if parts[:1] == ("figures",) else parts[:2]))
+    run = _run_of(place) or _run_of(results)
     configs = [word for config in run.get("config", ()) for word in ("--config", config)]
     name = Path(*run.get("results", ["results"]))
     target = [] if path == results else [scene or str(name / path.relative_to(results))]
@@ -56,6 +61,10 @@ def run_command(path: Path, *options: str, scene: str = "", settings: Mapping[st
     values += [f"{section}={json.dumps(changed)}" for section, changed in (settings or {}).items()]
     overrides = ["--", "--config", *values] if values else []
     return shlex.join(["hilsplat", "run", *configs, *options, *target, *overrides])
+
+
+def _run_of(folder: Path) -> dict[str, list[str]]:
+    return read_memo(folder / RUN, dict[str, list[str]])
 
 
 def rebuild_command(path: Path) -> str:

@@ -1,6 +1,7 @@
 """Caches: finished views and checkpoints, their sizes and pruning, and examinations of this machine."""
 
 import functools
+import getpass
 import logging
 import os
 import re
@@ -27,6 +28,8 @@ CHECKPOINTS = "gaussians"  # cache of fit checkpoints; in the others, a missing 
 
 CACHES = (CHECKPOINTS, "masks", "contributions", "clip", "texts", "int8")
 """Folders of entries that may be deleted."""
+
+PROBLEM_S = 3600.0  # how long a problem found by an examination counts
 
 FIT_DAYS = 1.0
 """Checkpoints younger than this are kept, because fits save more often and may still be running."""
@@ -140,13 +143,27 @@ def remembered(kind: str, key: object, examine: Callable[[], str]) -> str:
         kind: name of a folder of results, which `forget` clears.
         key: JSON value that changes if the result may change, such as versions of libraries.
     """
-    path = _folder(kind) / sha256_of_json(key)
-    with suppress(OSError, ValueError):
-        return path.read_text(encoding="utf-8")
+    known = recalled(kind, key)
+    if known is not None:
+        return known
     result = examine()
     with suppress(OSError, HilsplatError):
-        write_text(path, result)
+        write_text(_folder(kind) / sha256_of_json(key), result)
     return result
+
+
+def recalled(kind: str, key: object) -> str | None:
+    """Return the earlier result of `remembered`, or None.
+
+    A problem, a result that is not empty, counts for an hour: memory, a time limit or another job may be its
+    cause.
+    """
+    with suppress(OSError, ValueError):
+        path = _folder(kind) / sha256_of_json(key)
+        result = path.read_text(encoding="utf-8")
+        if not result or time.time() - path.stat().st_mtime < PROBLEM_S:
+            return result
+    return None
 
 
 def forget(kind: str) -> None:
@@ -161,6 +178,10 @@ def use_writable_cache() -> None:
 
     They would fail otherwise: numba, Snakemake and Matplotlib, in containers without a home.
     """
+    try:
+        getpass.getuser()
+    except (KeyError, OSError):  # a user without a name; Snakemake prints it
+        os.environ["LOGNAME"] = str(os.getuid())
     wanted = Path("~/.cache")
     with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
         wanted = platformdirs.user_cache_path()
@@ -170,7 +191,6 @@ def use_writable_cache() -> None:
     folder = _private_folder(tempfile.gettempdir())
     os.environ["XDG_CACHE_HOME"] = os.environ["MPLCONFIGDIR"] = str(folder)
     os.environ.setdefault("HOME", str(folder))
-    os.environ.setdefault("LOGNAME", str(os.getuid()))  # a user without a name
     logger.info("%s cannot be written; caches are kept in %s", wanted, folder)
 
 

@@ -60,23 +60,24 @@ def take_card(folder: Path | None = None, poll_s: float = 1.0) -> None:
     """Wait for a card that no other job of this user has, and let CUDA see only that card.
 
     It must be called before CUDA starts. The card is kept until `release_card` or the end of the process,
-    even if it is killed. Under Slurm, the scheduler has assigned cards, so none is taken.
+    even if it is killed. A process that has a card keeps it. Under Slurm, only processes of one Slurm job
+    share its cards, whose names may be those of other jobs' cards.
     """
     choice = cards()
-    if not choice or _held or "SLURM_JOB_ID" in os.environ:
+    if not choice or _held:
         return
     folder, is_waiting = folder or Path(tempfile.gettempdir()), False
+    owner = "-".join(filter(None, (str(os.getuid()), os.environ.get("SLURM_JOB_ID"))))
     while True:
         for name in choice:
-            stream = (folder / f"hilsplat-{os.getuid()}-card-{name.replace('/', '_')}.lock").open("ab")
+            stream = (folder / f"hilsplat-{owner}-card-{name.replace('/', '_')}.lock").open("ab")
             try:
                 lock(stream, wait=False)
             except BlockingIOError:
                 stream.close()
                 continue
             _held.append(stream)
-            # in the order of the driver's library; CUDA's own default is the fastest first
-            os.environ |= {"CUDA_VISIBLE_DEVICES": name, "CUDA_DEVICE_ORDER": "PCI_BUS_ID"}
+            os.environ["CUDA_VISIBLE_DEVICES"] = name  # in CUDA's own order, which is the same in each job
             return
         if not is_waiting:
             logger.info("waiting for one of %d cards, which other jobs use", len(choice))

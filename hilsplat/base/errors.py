@@ -140,6 +140,8 @@ MACHINE = {
     errno.EIO: "cannot be read or written: the disk reported an error",
     errno.ESTALE: "cannot be read or written: the network disk has lost it",
     errno.ENOLCK: "cannot be locked: the network disk has no lock service",
+    errno.ENOSYS: "cannot be locked: mount its disk with locks, Lustre with the option flock",
+    errno.EOPNOTSUPP: "cannot be locked: mount its disk with locks, Lustre with the option flock",
     errno.ENOSPC: "cannot be written: the disk is full",
     errno.EDQUOT: "exceeds your disk quota",
 }

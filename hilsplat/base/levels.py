@@ -1,6 +1,7 @@
 """The three semantic levels, coarse to fine, and queries with a text for each of several levels."""
 
 import unicodedata
+from collections.abc import Collection
 from enum import IntEnum
 
 from hilsplat.base.errors import SettingsError
@@ -46,6 +47,11 @@ MAX_TEXT = 500  # maximum number of characters in a query; CLIP reads 77 tokens
 def composed(text: str) -> str:
     """Return a text in composed Unicode; macOS decomposes the names of files."""
     return unicodedata.normalize("NFC", text)
+
+
+def spelt(name: str, names: Collection[str]) -> str | None:
+    """Return the one of `names` that equals a name, if need be in composed Unicode, or None."""
+    return name if name in names else next((same for same in names if composed(same) == composed(name)), None)
 
 
 def plain_text(text: str) -> str:

@@ -6,9 +6,11 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Collection, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -60,6 +62,24 @@ def sha256_of_file(path: Path) -> str:
         raise
 
 
+def copies_of(paths: Iterable[Path]) -> dict[Path, Path]:
+    """Map each copy of another file to that file; of files with the same bytes, the shortest name is kept.
+
+    Only files of equal size are read. Empty and unreadable files have no copies.
+    """
+    by_size: dict[int, list[Path]] = defaultdict(list)
+    for path in paths:
+        with suppress(OSError):  # reported where the file is used
+            by_size[path.stat().st_size].append(path)
+    copies, originals = {}, dict[str, Path]()
+    for size, same in by_size.items():
+        for path in sorted(same, key=lambda path: (len(path.name), path)) if size and len(same) > 1 else ():
+            with suppress(OSError):
+                if (original := originals.setdefault(sha256_of_file(path), path)) != path:
+                    copies[path] = original
+    return copies
+
+
 def sha256_of_path(path: Path) -> str:
     """Return the SHA-256 of a file, or of the names and bytes of a folder's non-hidden files."""
     path = Path(path)
@@ -71,8 +91,11 @@ def sha256_of_path(path: Path) -> str:
     return sha256_of_json([(file.relative_to(path).as_posix(), sha256_of_file(file)) for file in files])
 
 
+UNREADABLE = "unreadable"
+
+
 def digests_of(paths: Collection[str], memo: Path) -> dict[str, str]:
-    """Map each path to its file's SHA-256, or "unreadable"; only files that changed since `memo` are read.
+    """Map each path to its file's SHA-256, or `UNREADABLE`; only files that changed since `memo` are read.
 
     Programs cannot set the status change time, so it reveals a replacement of the same size and time.
     """
@@ -96,7 +119,7 @@ def digests_of(paths: Collection[str], memo: Path) -> dict[str, str]:
             list(threads.map(read, changed))
         with suppress(OSError, HilsplatError):  # a read-only folder of results, or a full disk
             write_json(memo, old | entries)
-    return {path: entries.get(path, "unreadable").split()[-1] for path in paths}
+    return {path: entries.get(path, UNREADABLE).split()[-1] for path in paths}
 
 
 def visible_files(folder: Path) -> list[Path]:
@@ -189,6 +212,10 @@ class Inputs:
         return {"path": os.path.commonpath(digests) if digests else "", "files": digests}
 
 
+RASTERISER: ContextVar[str | None] = ContextVar("RASTERISER", default=None)
+"""Device that the running stage has chosen for rasterising, for its provenance record."""
+
+
 def write_provenance(
     artifact: Path,
     *,
@@ -200,7 +227,6 @@ def write_provenance(
     inputs: Inputs,
     beside: Sequence[Path] = (),
     plugins: Sequence[str] = (),
-    device: str | None = None,
 ) -> None:
     """Write an artifact's provenance record: command, settings, inputs, software, and digests of outputs."""
     folder = Path(artifact).parent
@@ -212,7 +238,7 @@ def write_provenance(
         "plugins": list(plugins),
         "settings": dict(settings),
         "seed": seed,
-        "device": device,
+        "device": RASTERISER.get(),
         "inputs": inputs.records,
         "outputs": {
             os.path.relpath(path, folder): {"sha256": sha256_of_path(path), "bytes": sizes_of(path)}

@@ -6,6 +6,7 @@ import hashlib
 import logging
 import os
 import secrets
+import select
 import signal
 import socket
 import subprocess
@@ -53,6 +54,9 @@ def end_with_parent(parent: int) -> None:
 
 
 def _watch(parent: int) -> None:
+    with suppress(OSError, AttributeError):  # without pidfd, or already gone
+        select.select([os.pidfd_open(parent)], [], [])  # also if its parent doesn't await it
+        os._exit(1)
     while is_alive(parent):
         time.sleep(1)
     os._exit(1)
@@ -136,6 +140,23 @@ def host_token() -> str:
     return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
 
 
+@functools.cache
+def boot_id() -> str:
+    """Return what identifies this start of this machine, also in its containers; empty if unknown."""
+    with suppress(OSError):
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    return ""
+
+
+def num_cores() -> int:
+    """Return the number of cores that this process may use, by its affinity and a container's quota."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with suppress(OSError, ValueError):  # ValueError: "max"
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text(encoding="ascii").split()
+        cores = min(cores, max(1, round(int(quota) / int(period))))
+    return cores
+
+
 @contextmanager
 def unfinished_folder(parent: Path) -> Iterator[Path]:
     """Create a folder for unfinished files, and delete it at the end; first delete those of killed processes.
@@ -153,6 +174,9 @@ def unfinished_folder(parent: Path) -> Iterator[Path]:
         try:
             stream = (folder / LOCK).open("ab")
             lock(stream)
+            with suppress(OSError):  # a full disk
+                stream.write(boot_id().encode())
+                stream.flush()
             is_locked = os.fstat(stream.fileno()).st_nlink > 0
         except BaseException as error:
             delete(folder)
@@ -185,13 +209,15 @@ def _is_removed(path: Path) -> bool:
     """Delete a folder of unfinished files unless its writer is alive; return whether it was deleted.
 
     Files of live processes, including those in other containers, are kept. If the folder is shared, files
-    from other hosts are also kept, because their locks may be invisible here. A folder without a lock is not
-    ours, unless it is empty.
+    from other hosts are also kept, because their locks may be invisible here; containers on one machine may
+    have other host names. A folder without a lock is not ours, unless it is empty.
     """
     match = UNFINISHED.fullmatch(path.name)
-    if match is None or match["host"] != host_token() or path.is_symlink():
+    if match is None or path.is_symlink():
         return False
     with suppress(OSError):
+        if match["host"] != host_token() and (path / LOCK).read_bytes() != (boot_id() or "?").encode():
+            return False
         is_new = not any(path.iterdir())  # its writer may be about to create the lock
         with (path / LOCK).open("ab" if is_new else "rb+") as stream:
             lock(stream, wait=False)

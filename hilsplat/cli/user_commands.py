@@ -98,14 +98,14 @@ def scene_folder(scene: str, results: Path, variant: str = "") -> Path:
         ArtifactError: there is no such scene or, if given, variant; the message lists those that exist.
         SettingsError: the name is ambiguous.
     """
-    from hilsplat.scene.finished import require_scene_folder, require_variant, scenes_in
+    from hilsplat.scene.finished import holds_scenes, require_scene_folder, require_variant, scenes_in
 
     matching = [name for name in scenes_in(results) if scene in (name, name.partition("/")[2])]
     if len(matching) > 1:
         expected = f"one of {', '.join(matching)}"
         raise SettingsError(f"{scene!r} matches several scenes", expected=expected)
     named = results / (matching[0] if matching else scene)
-    folder = Path(scene) if not named.is_dir() and Path(scene).is_dir() else named
+    folder = Path(scene) if not named.is_dir() and holds_scenes(Path(scene)) else named
     require_scene_folder(folder)
     if variant:
         require_variant(folder, variant)

@@ -58,7 +58,8 @@ BASE_MIB, WEIGHT_BYTES, GAUSSIAN_BYTES = 350, 24, 200
 IN_MEMORY = 2**20  # G and W of more Gaussians are summed in files
 
 MAX_WEIGHTS_TOGETHER = 2**25
-"""Views with more weights (256 MiB) are prepared one at a time; up to four finished views may be waiting."""
+"""Views with more weights (256 MiB), and views on a card, are prepared one at a time; up to four finished
+views may be waiting."""
 
 
 class ArrayStream:
@@ -158,8 +159,8 @@ def run_contributions(
 ) -> None:
     """Write A, A_half, S, mass, and G or W, in one pass over the training views.
 
-    One or two views are prepared while rows of previous views are written and added to G. Memory contains
-    these views and the sums so far; sums that don't fit into `memory_mib` are in files. After an
+    One view, or two on the CPU, are prepared while rows of previous views are written and added to G. Memory
+    contains these views and the sums so far; sums that don't fit into `memory_mib` are in files. After an
     interruption, a rerun reads the matrices of finished views from the cache, and G from a checkpoint at most
     `CHECKPOINT_SECONDS` (and one view) old; it rasterises W again for views not yet in that G.
 
@@ -195,8 +196,9 @@ def run_contributions(
         f"contributions of {len(gaussians):,} Gaussians in a view of {scene.name}",
         "lower poses.max_side_px or gaussians.max_gaussians",
     )
-    # half the work on a view uses one thread
-    together = min(2, max(1, threads)) if weights_of_view <= MAX_WEIGHTS_TOGETHER else 1
+    # half the work on a view uses one thread; a card has memory for one view
+    is_small = weights_of_view <= MAX_WEIGHTS_TOGETHER and device == "cpu"
+    together = min(2, max(1, threads)) if is_small else 1
     if fixed_mib + together * view_mib > limit_mib(memory_mib):
         together = 1
     sums_mib = limit_mib(memory_mib) - fixed_mib - together * view_mib

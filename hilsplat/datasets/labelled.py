@@ -22,7 +22,7 @@ from hilsplat.base.levels import Level, composed, plain_text
 from hilsplat.datasets.dataset import SceneReport
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.layouts import find_known_poses
-from hilsplat.scene.placement import placement
+from hilsplat.scene.placement import of_view, placement
 from hilsplat.scene.view_names import view_name, view_names
 
 if TYPE_CHECKING:  # imports pycolmap, which evaluation doesn't need
@@ -44,6 +44,7 @@ class LabelledRegion:
     path: tuple[str, ...] = ()  # texts from the whole down to this region; its own text without levels
     # Like `pixels`, but all non-black pixels, as in some protocols; None if identical.
     any_grey: Callable[[], Bool[np.ndarray, "H W"]] | None = None
+    on_view: bool = False  # drawn on the view, not on its photograph; if False, the size decides
 
     def mask(
         self, size_hw: tuple[int, int] | None = None, *, any_grey: bool = False
@@ -63,7 +64,7 @@ class LabelledRegion:
         A box becomes the extent of its pixels in the view; a box outside the view is omitted. For errors, see
         `placement`.
         """
-        place = placement(camera, self.size_hw, where)
+        place = placement(of_view(camera) if self.on_view else camera, self.size_hw, where)
         if place is None:
             return self
         boxes, grey = self.boxes_xyxy, self.any_grey
@@ -128,6 +129,10 @@ class LabelledScene:
     @property
     def num_pairs(self) -> int:
         return sum(len({region.text for region in regions}) for regions in self.views.values())
+
+    def image_hw(self, view: str) -> tuple[int, int] | None:
+        """Return the size of a view's image in the data set; None if the data set has no image of it."""
+        return image_size_hw(self.images[view]) if view in self.images else None
 
     def check_posed(self, names: Collection[str]) -> list[str]:
         """Return the labelled views that have a pose; log the others.

@@ -35,6 +35,10 @@ DATASETS: Plugins[Dataset] = Plugins(
 """Supported data sets in the order of the paper's tables."""
 
 
+ANNOTATED = "annotated"
+"""Data set of your own annotations, whose scenes are named `data set/scene`."""
+
+
 def readers_of(labels: Collection[str]) -> tuple[str, ...]:
     """Return the import paths of what reads labels, such as "lerf_ovs/figurines" or "world:room:1"."""
     places = {**entry_points("hilsplat.generators").places, **DATASETS.places}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hilsplat.base.errors import SceneError, SettingsError, in_one_line
 from hilsplat.base.lineage import files_of
-from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels, scene_of
+from hilsplat.datasets.registry import ANNOTATED, DATASETS, dataset_of, open_labels, scene_of
 from hilsplat.scene.sheet import DATA_PREFIX
 
 logger = logging.getLogger(__name__)
@@ -71,8 +71,8 @@ def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
     Raises:
         SettingsError: they are in the working folder, but `data_root` has those of other scenes.
     """
-    own_name = f"annotated/{row}"
-    root = dataset_of("annotated").root(data_root).parent
+    own_name = f"{ANNOTATED}/{row}"
+    root = dataset_of(ANNOTATED).root(data_root).parent
     own_labels = (own_name,) if any((root / own_name).glob("*.json")) else ()
     if not own_labels and any(Path(own_name).glob("*.json")):
         raise SettingsError(

@@ -16,7 +16,7 @@ from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsEr
 from hilsplat.base.files import INSTALLED
 from hilsplat.models.card import CPU, Batches, in_turn, network_device
 from hilsplat.models.folder import WHOLE_COPY, ModelFolder, input_side_px, open_model_folder
-from hilsplat.models.memory import needs_of
+from hilsplat.models.memory import CARD_CROPS, card_mib
 from hilsplat.models.network import Array, Network, require_one_space
 from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 from hilsplat.models.store import MODELS, user_models
@@ -31,7 +31,7 @@ SIGLIP_STATISTICS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 """Mean and deviation of pixels if `preprocessor_config.json` lacks them, as in transformers."""
 SIGLIP_TOKENS = 64  # text length (tokens) of a SigLIP model whose configuration does not specify it
 NO_PUNCTUATION = str.maketrans("", "", string.punctuation)
-CARD_CROPS, MAX_CROPS = 64, 256  # crops of a card's first call, and maximum of later calls
+MAX_CROPS = 256  # per call on a card, after the first call
 MAX_TEXTS = 20_000  # number of texts whose vectors, of 2 to 5 KB, are kept for later queries
 MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # configurations of the models in `models/`
 
@@ -125,8 +125,7 @@ class ClipModel:
         Errors as in `open_model_folder` and `network_device`.
         """
         opened = open_model_folder(folder, "clip", variant=variant)
-        chosen_device = network_device(device, "clip", needs_of(opened, CARD_CROPS).card_mib)
-        model = ClipModel(opened, device=chosen_device)
+        model = ClipModel(opened, device=network_device(device, "clip", card_mib(opened)))
         _ = model.vision  # open and check it now
         return model
 

@@ -10,12 +10,13 @@ from pydantic import Field
 
 from hilsplat.base.artifacts import read_memo, write_json
 from hilsplat.base.cache import writable
-from hilsplat.base.errors import HilsplatError, in_one_line
+from hilsplat.base.errors import HilsplatError, MemoryLimitError, in_one_line
 from hilsplat.embed.clip import ClipModel
-from hilsplat.models.card import in_turn
+from hilsplat.models.card import card_shortage, in_turn
 from hilsplat.models.folder import input_side_px, open_model_folder
 from hilsplat.models.int8 import int8_network, reduced_precision
 from hilsplat.models.layouts import SECTIONS
+from hilsplat.models.memory import card_mib
 from hilsplat.models.network import require_one_space
 from hilsplat.models.repeatable import random_pixels
 from hilsplat.models.store import broken_models, present_models
@@ -83,13 +84,20 @@ def card_disagreement(folder: Path, device: str = "cuda") -> str | None:
     """Return how a model's image network differs between a card and the CPU, or why it fails on the card.
 
     None means that both agree.
+
+    Raises:
+        MemoryLimitError: the card has too little free memory.
     """
     model = open_model_folder(folder)
     try:
+        if device == "cuda" and (problem := card_shortage(card_mib(model))):
+            raise MemoryLimitError(problem)
         is_sam = model.kind == "sam"
         on_card = SamModel(model, device).encoder if is_sam else ClipModel(model, device=device).vision
         pixels = random_pixels(on_card, input_side_px(model))
         on_device = in_turn(device, SECTIONS[model.kind], lambda: on_card(**pixels))
+    except MemoryLimitError:
+        raise
     except HilsplatError as error:
         return f"{device}: {in_one_line(error)}"
     pairs = zip(model.network(IMAGE_NETWORKS[model.kind])(**pixels), on_device, strict=True)

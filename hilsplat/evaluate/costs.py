@@ -5,6 +5,7 @@ name suffix `-seconds`. All other files are reproducible byte for byte.
 """
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from hilsplat.configuration import SECTIONS
 
 PREPARATION = ("masks", "coverage_tree", "clip")
 TRAINING = ("contributions", "semantic_tree", "autoencoder", "field")
+FROM_CACHE = re.compile(r"\bfrom_cache [1-9]")  # in the log of a job that read finished views (`stage_log`)
 TIMES = "times.csv"
 TIME_COLUMNS = ("dataset", "scene", "variant", "method", "seconds")
 
@@ -33,6 +35,7 @@ class Job:
     elapsed_s: float  # wall-clock time
     cpu_s: float  # of the job and its child processes; 0 if the job was too short to be sampled
     peak_mib: float  # peak resident memory; 0 if the job was too short to be sampled
+    is_partial: bool = False  # whether an earlier job computed some of its views, whose time is not included
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,7 @@ class Cost:
     peak_mib: float  # peak resident memory of the training jobs
     query_s: Mapping[str, float]  # per method, seconds from a text to a mask in a view
     unrecorded: tuple[str, ...] = ()  # stages whose times are missing from the results folder
+    partial: tuple[str, ...] = ()  # stages whose times don't include views from the cache
 
 
 def write_times(scores: Path, dataset: str, scene: str, variant: str, seconds: Mapping[str, float]) -> None:
@@ -70,7 +74,8 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
         peak_mib = 0.0 if None in training else max((job.peak_mib for job in training if job), default=0.0)
         query_s = {row["method"]: float(row["seconds"]) for row in rows}
         unrecorded = tuple(stage for stage, job in jobs.items() if job is None)
-        costs.append(Cost(*names, *times, peak_mib or math.nan, query_s, unrecorded))
+        partial = tuple(stage for stage, job in jobs.items() if job and job.is_partial)
+        costs.append(Cost(*names, *times, peak_mib or math.nan, query_s, unrecorded, partial))
     return costs
 
 
@@ -154,11 +159,14 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
     """
     folders = path.relative_to(results).parts[:-2]
     dataset, scene, variant = (*folders, "", "", "")[:3]
-    jobs = []
+    jobs = list[Job]()
+    log = path.parents[1] / "logs" / f"{path.stem}.log"  # of the last job, as the benchmark
+    is_partial = log.is_file() and bool(FROM_CACHE.search(log.read_text(encoding="utf-8", errors="replace")))
     with foreign(path, ArtifactError, problem="is not a valid benchmark file", fix="run its stage again"):
         for line in path.read_text(encoding="utf-8").splitlines() or [""]:
             record = parse_json(line)
             sampled = (record.get("cpu_time"), record.get("max_rss"))  # "-" or null if Snakemake couldn't
-            numbers = (float(value) if isinstance(value, int | float) else 0.0 for value in sampled)
-            jobs.append(Job(path.stem, dataset, scene, variant, float(record["s"]), *numbers))
+            cpu_s, peak_mib = (float(v) if isinstance(v, int | float) else 0.0 for v in sampled)
+            names = path.stem, dataset, scene, variant
+            jobs.append(Job(*names, float(record["s"]), cpu_s, peak_mib, is_partial))
     return jobs

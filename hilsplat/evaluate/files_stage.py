@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64, Int64
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError, foreign
 from hilsplat.base.files import list_masks
-from hilsplat.base.images import image_size_hw, read_mask
+from hilsplat.base.images import read_mask
 from hilsplat.base.progress import stage_log
 from hilsplat.base.tables import aligned_table
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
@@ -92,8 +92,8 @@ def run_evaluate_files(
             else:
                 for view, regions in labelled.views.items():
                     if regions:
-                        image_hw = image_size_hw(labelled.images[view]) if view in labelled.images else None
-                        views[view] = partial(ViewTruth.of_regions, regions, regions[0].size_hw, image_hw)
+                        sizes_hw = regions[0].size_hw, labelled.image_hw(view)
+                        views[view] = partial(ViewTruth.of_regions, regions, *sizes_hw)
         if not views and not points:
             raise ArtifactError(
                 f"{labels or truth} has neither a labelled region nor a labelled point",

@@ -14,6 +14,7 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.generators import Truth
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import PointScene
+from hilsplat.datasets.registry import ANNOTATED
 from hilsplat.evaluate.costs import write_times
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
@@ -61,7 +62,8 @@ def run_evaluate(
     written beside `scores.csv`. Without truth and labels, `scores.csv` contains only its header.
 
     Args:
-        dataset: data set recorded in every row, as are `scene` and `variant`.
+        dataset: data set recorded in every row, as are `scene` and `variant`. Rows of `labels` record theirs;
+            in rows of your own annotations, the scene is `dataset/scene`, as in `run_evaluate_files`.
         truth: ground-truth folder of a generated scene, whose `source` determines its benchmarks.
         labels: labels of published data sets, such as "lerf_ovs/figurines", instead of `truth`.
 
@@ -76,8 +78,9 @@ def run_evaluate(
     label = masks_label(parts.masks)
 
     def keep(data: str, view: str, measured: Measured) -> None:
+        name = f"{dataset}/{scene}" if data == ANNOTATED else scene
         scores.append(
-            Score(dataset=data, scene=scene, variant=variant, masks=label, view=view, **vars(measured))
+            Score(dataset=data, scene=name, variant=variant, masks=label, view=view, **vars(measured))
         )
 
     with stage_log("evaluate", f"{dataset}/{scene}/{variant}") as counts:
@@ -203,7 +206,7 @@ def time_queries(
     rule = rule_of(settings)
 
     def by_field(text: str) -> object:
-        relevancy = answers.field.relevancy([text], view)[0]
+        relevancy = answers.field.relevancy([text], view, exact=False)[0]
         return relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
 
     def by_tree(text: str) -> object:

@@ -3,6 +3,7 @@
 import logging
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from threading import RLock
@@ -11,7 +12,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from jaxtyping import Int64
 
-from hilsplat.base.cards import cards, has_driver, release_card
+from hilsplat.base.cards import cards, has_driver, release_card, take_card
 from hilsplat.base.errors import DeviceError, MemoryLimitError, first_line
 from hilsplat.base.memory import MIB
 
@@ -32,7 +33,11 @@ def card_problem() -> str | None:
     try:
         import torch
 
-        if not torch.cuda.is_available():
+        with warnings.catch_warnings(record=True, action="always") as caught:
+            is_available = torch.cuda.is_available()
+        if not is_available and caught:  # such as of an old driver
+            return f"CUDA cannot be used: {first_line(caught[-1].message)}"
+        if not is_available:
             return f"torch {torch.__version__} finds no CUDA device"
         version, built_for = torch.cuda.get_device_capability(), torch.cuda.get_arch_list()
         problem = "no kernels for compute capability {}.{}, only {}".format(*version, " ".join(built_for))
@@ -61,46 +66,51 @@ def free_mib(device: str = "cuda") -> float:
     return (torch.cuda.mem_get_info(device)[0] + reserved) / MIB
 
 
+def card_shortage(needed_mib: float) -> str | None:
+    """Return why a card doesn't have this much free memory, or None; CUDA is started, which takes memory."""
+    try:
+        free = free_mib()
+    except Exception as error:  # torch raises several types if another program uses the card
+        return f"CUDA cannot be started: {first_line(error)}"
+    if free < needed_mib:
+        return f"the GPU has {free / 1024:.1f} GiB free, and about {needed_mib / 1024:.1f} are needed"
+    return None
+
+
 def network_device(requested: Literal["auto", "cpu", "cuda"], section: str, needed_mib: float) -> str:
     """Return the device for the networks of a section of the settings, and log it.
 
     `auto` uses a card if torch finds one with enough free memory; otherwise, the reason is logged, as a
-    warning if there is a card.
+    warning if there is a card. If another job has the card, this function waits for it (`take_card`).
 
     Raises:
-        DeviceError: `cuda` was requested, but there is no usable card.
-        MemoryLimitError: `cuda` was requested, but the card has less than `needed_mib` of free memory.
+        DeviceError: `cuda` was requested, but there is no usable card with enough free memory.
     """
-    problem = "device: cpu" if requested == CPU else card_problem()
-    free = needed_mib
-    if problem is None and needed_mib:  # 0: CUDA isn't started, because it takes memory itself
-        try:
-            free = free_mib()
-        except Exception as error:  # torch raises several types if another program uses the card
-            problem = f"CUDA cannot be started: {first_line(error)}"
-    if requested == "cuda" and problem:
+    if requested == CPU:
+        return CPU
+    if has_driver():
+        take_card()  # before CUDA starts
+    problem = card_problem() or card_shortage(needed_mib)
+    if not problem:
+        logger.info("%s runs on the GPU", section)
+        return "cuda"
+    release_card()
+    if requested == "cuda":
+        require_card(problem, section)
+    logger.log(logging.WARNING if cards() else logging.DEBUG, "%s runs on the CPU: %s", section, problem)
+    return CPU
+
+
+def require_card(problem: str | None, section: str) -> None:
+    """Raise DeviceError if there is a problem with the card that the networks of a section need."""
+    if problem:
         raise DeviceError(
             f"{section}.device: cuda was requested but cannot be used",
-            expected="an NVIDIA card, its driver, and a CUDA build of torch for this card",
+            expected="an NVIDIA card with enough memory, its driver, and a CUDA build of torch for this card",
             found=problem,
-            fix=f"set {section}.device: auto or cpu",
+            fix=f"set {section}.device: auto or cpu; if only memory is short, end other programs on the GPU, "
+            f"or use a smaller model ({section}.model)",
         )
-    if requested == "cuda" and free < needed_mib:
-        raise MemoryLimitError(
-            f"the model in {section}.model needs more memory than the GPU has free",
-            expected=f"about {needed_mib / 1024:.1f} GiB",
-            found=f"{free / 1024:.1f} GiB",
-            fix=_fix(section),
-        )
-    if not problem and free < needed_mib:
-        problem = f"the GPU has {free / 1024:.1f} GiB free, and about {needed_mib / 1024:.1f} are needed"
-    if problem:
-        level = logging.WARNING if requested != CPU and cards() else logging.DEBUG
-        logger.log(level, "%s runs on the CPU: %s", section, problem)
-        release_card()
-        return CPU
-    logger.info("%s runs on the GPU", section)
-    return "cuda"
 
 
 def recorded(device: str) -> dict[str, str]:
@@ -156,8 +166,9 @@ class Batches:
         """
         start = 0
         while start < total:
-            number = min(self.size, total - start)
-            rows = np.arange(start, start + (self.size if self.is_padded else number))
+            size = self.size  # read once, because other threads may change it
+            number = min(size, total - start)
+            rows = np.arange(start, start + (size if self.is_padded else number))
             rows = np.minimum(rows, total - 1)
             problem = ""
             try:

@@ -24,6 +24,7 @@ previewed, plus the masks of the prompts that are kept."""
 CLIP_TOKEN_MIB = 0.03
 """Memory per patch of a crop in a CLIP model, not counting two arrays of attention weights. Measured: 521 MiB
 for 64 crops in ViT-B/16."""
+CARD_CROPS = 64  # crops of a card's first call
 SAM_HEADS, SAM2_HEADS = 12, 4
 """Attention heads if the configuration does not specify them (SAM 2 and EdgeTAM: of the global attention)."""
 UNKNOWN_BYTES_PER_PX = 400
@@ -36,11 +37,6 @@ class Needs:
 
     weights_mib: float
     view_mib: float
-
-    @property
-    def card_mib(self) -> float:
-        """Memory on a card, where one view or batch is processed at a time, MiB."""
-        return self.weights_mib + self.view_mib
 
     def total_mib(self, views: int) -> int:
         """Return the memory of a stage that processes this many views at once, MiB."""
@@ -91,6 +87,12 @@ def needs_of(
         return Needs(weights, batch * image)
     decoder = batch * PROMPT_MIB if as_exported else FACTORED_MIB
     return Needs(weights, image + decoder * (side / 1024) ** 2)
+
+
+def card_mib(model: ModelFolder) -> float:
+    """Estimate the memory of a model on a card, where one view or batch is processed at a time, MiB."""
+    needs = needs_of(model, CARD_CROPS if model.kind == "clip" else 1, as_exported=True)
+    return needs.weights_mib + needs.view_mib
 
 
 def _attention_mib(vision: dict[str, Any], side_px: int, default_heads: int = SAM_HEADS) -> float:

@@ -47,7 +47,7 @@ def require_repeatable_once(
 
     def check() -> str:
         require_repeatable(network, feeds, {name: np.flip(value, axis=-1) for name, value in feeds.items()})
-        return "repeatable"
+        return ""  # no problem
 
     key = [model.digest, network.path.name, form, network.version, network.runs_on]
     remembered("networks", key, check)

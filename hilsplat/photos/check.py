@@ -26,8 +26,8 @@ from hilsplat.base.images import (
     require_usable_size,
     resize_to_fit,
 )
-from hilsplat.base.lineage import sha256_of_file
-from hilsplat.base.processes import in_order
+from hilsplat.base.lineage import copies_of
+from hilsplat.base.processes import in_order, num_cores
 from hilsplat.base.progress import track
 from hilsplat.scene.features import exif_focal_px
 from hilsplat.scene.layouts import photo_folder
@@ -102,11 +102,12 @@ class PhotoReport:
         sizes: number of readable photographs per upright size (height, width), px.
         unreadable: (file name, reason) of each image that cannot be read.
         num_rotated: number of photographs that are rotated according to their EXIF orientation.
-        duplicates: groups of file names with identical bytes.
+        duplicates: groups of file names with identical bytes. Without known poses, the first is used.
         passed_over: number of skipped files in unsupported photograph formats, by suffix.
         doubts: likely problems and what to do about them (`check`).
         notes: how the folder was made (`intake`), and what else in it is used or left out (`findings`).
         columns: paths of these other parts for the scene sheet, by column.
+        have_poses: whether the poses are known.
     """
 
     folder: Path
@@ -118,6 +119,7 @@ class PhotoReport:
     doubts: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     columns: dict[str, Path] = field(default_factory=dict)
+    have_poses: bool = False
 
     @property
     def num_readable(self) -> int:
@@ -132,7 +134,8 @@ class PhotoReport:
             lines.append(f"  {self.num_rotated:>5}  rotated upright according to their EXIF orientation")
         if copies := sum(len(names) - 1 for names in self.duplicates):
             equal = shorten_list([" = ".join(names) for names in self.duplicates], 5)
-            lines.append(f"  {copies:>5}  are copies of others: {equal}")
+            fate = "" if self.have_poses else " and are left out"
+            lines.append(f"  {copies:>5}  are copies of others{fate}: {equal}")
         for suffix, count in sorted(self.passed_over.items()):
             lines.append(f"  {count:>5}  {suffix} files skipped: convert them to JPEG or PNG to use them")
         if self.unreadable:
@@ -154,13 +157,12 @@ def inspect_photos(folder: Path, posed: Sequence[Path] = ()) -> PhotoReport:
     folder = Path(os.path.commonpath([path.parent for path in photos])) if photos else photo_folder(folder)
     view_names(photos)
     unreadable: list[tuple[str, str]] = []
-    by_digest: dict[str, list[str]] = defaultdict(list)
     num_rotated = 0
     checked: list[CheckedPhoto] = []
     matched, have_poses = matched_rows(len(photos)), bool(posed)
 
-    def inspected(row: int) -> tuple[CheckedPhoto, bool, str] | str:
-        """Return a photograph, whether it is turned, and its digest, or why it cannot be read."""
+    def inspected(row: int) -> tuple[CheckedPhoto, bool] | str:
+        """Return a photograph and whether it is turned, or why it cannot be read."""
         path = photos[row]
         name = path.relative_to(folder).as_posix()
         try:
@@ -173,27 +175,30 @@ def inspect_photos(folder: Path, posed: Sequence[Path] = ()) -> PhotoReport:
         with opened_image(path) as image:
             is_turned = orientation(image) > 1
         is_matched = row in matched and not have_poses
-        return checked_photo(name, pixels, focal_px, is_matched=is_matched), is_turned, sha256_of_file(path)
+        return checked_photo(name, pixels, focal_px, is_matched=is_matched), is_turned
 
-    reads = in_order(inspected, range(len(photos)), num_readers(photos, os.cpu_count() or 1))
+    reads = in_order(inspected, range(len(photos)), num_readers(photos, num_cores()))
     for path, found in zip(photos, track(reads, "photographs checked", len(photos)), strict=True):
         if isinstance(found, str):
             unreadable.append((path.relative_to(folder).as_posix(), found))
             continue
-        photo, is_turned, digest = found
+        photo, is_turned = found
         num_rotated += is_turned
         checked.append(photo)
-        by_digest[digest].append(photo.name)
-    copies = {name for names in by_digest.values() for name in names[1:]}
+    copies = {path.relative_to(folder).as_posix(): original for path, original in copies_of(photos).items()}
     distinct = [photo for photo in checked if photo.name not in copies]
+    same: dict[Path, list[str]] = defaultdict(list)
+    for name in (photo.name for photo in checked if photo.name in copies):
+        same[copies[name]].append(name)
     return PhotoReport(
         folder=folder,
         sizes=Counter(photo.size_hw for photo in checked),
         unreadable=tuple(unreadable),
         num_rotated=num_rotated,
-        duplicates=tuple(tuple(names) for names in by_digest.values() if len(names) > 1),
+        duplicates=tuple((first.relative_to(folder).as_posix(), *names) for first, names in same.items()),
         passed_over=Counter(path.suffix.lower() for path in list_files(folder, OTHER_PHOTO_SUFFIXES)),
         doubts=tuple(photo_doubts(distinct, have_poses=have_poses)),
+        have_poses=have_poses,
     )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from hilsplat.base.artifacts import read_memo, write_json
 from hilsplat.base.atomic import atomic_folder, require_free_space
-from hilsplat.base.errors import SceneError, foreign
+from hilsplat.base.errors import HilsplatError, SceneError, foreign
 from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_outside, list_files, list_images
 from hilsplat.base.lineage import CONVERTED
 from hilsplat.base.removal import undone_on_error
@@ -78,7 +78,13 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
         fix = "choose another name for the scene, or move that folder"
         raise SceneError(f"{target} already exists", fix=fix)
     with undone_on_error(target) if is_new else nullcontext():
-        yield unwrapped(target), notes
+        try:
+            yield unwrapped(target), notes
+        except HilsplatError as error:
+            if is_new and not videos:  # the error names files that are about to be removed
+                advice = f"unpack {source.name} yourself, and pass the folder of its photographs"
+                error.add_line("note", f"{target} is removed again; to change its files, {advice}")
+            raise
 
 
 def _videos_of(source: Path) -> list[Path]:

@@ -1,5 +1,6 @@
 """Query a finished scene: report the ranked answers as text, and draw a picture."""
 
+import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
@@ -7,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilsplat.base.atomic import atomic_folder, atomic_path
+from hilsplat.base.atomic import atomic_folder, atomic_path, existing_folder
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, PATH_SEPARATOR, path_of
 from hilsplat.base.lineage import sha256_of_bytes
@@ -70,6 +71,8 @@ def answer(
     note = f"; diagnostic only, with masks made from true labels: {label}" if made_from_truth(label) else ""
     caution = scene.caution_about(text)
     yield report(scene, text, nodes, view, threshold) + note + (f"\n{caution}" if caution else "")
+    if out is None and not os.access(existing_folder(folder), os.W_OK):  # results of another user
+        raise SettingsError(f"{folder} cannot be written", fix="choose another folder for the files: --out")
 
     from hilsplat.query.query_panel import query_panel
 

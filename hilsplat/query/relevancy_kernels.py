@@ -25,15 +25,15 @@ def _dots_of_block(channels, begin, end, offset, slope, out):
         row_w, row_x = channels[c + 4, begin:end], channels[c + 5, begin:end]
         row_y, row_z = channels[c + 6, begin:end], channels[c + 7, begin:end]
         for p in range(end - begin):
-            first = s * row_s[p] + t * row_t[p]
-            second = u * row_u[p] + v * row_v[p]
-            third = w * row_w[p] + x * row_x[p]
-            fourth = y * row_y[p] + z * row_z[p]
+            first = s * np.float32(row_s[p]) + t * np.float32(row_t[p])
+            second = u * np.float32(row_u[p]) + v * np.float32(row_v[p])
+            third = w * np.float32(row_w[p]) + x * np.float32(row_x[p])
+            fourth = y * np.float32(row_y[p]) + z * np.float32(row_z[p])
             out[p] += (first + second) + (third + fourth)
     for c in range(eights, len(channels)):
         row, weight = channels[c, begin:end], slope[c]
         for p in range(end - begin):
-            out[p] += weight * row[p]
+            out[p] += weight * np.float32(row[p])
 
 
 @compiled
@@ -61,8 +61,8 @@ def lengths_and_generic(channels, cross, mean_square, offsets, slopes, length, g
 def texts_relevancy(channels, length, generic, first, offsets, slopes, scale, out):
     """Write the relevancy (T, p) of texts at pixels starting with `first`; `channels` has shape (D, P).
 
-    The cosine of a text is (offset + slope . channels) / length. All texts are processed while a block of
-    pixels is in the cache.
+    The cosine of a text is (offset + slope . channels) / length; an empty `length` means length 1. All
+    texts are processed while a block of pixels is in the cache.
     """
     dots = np.empty(BLOCK, np.float32)
     last = first + out.shape[1]
@@ -70,8 +70,9 @@ def texts_relevancy(channels, length, generic, first, offsets, slopes, scale, ou
         end = min(begin + BLOCK, last)
         for text in range(len(out)):
             _dots_of_block(channels, begin, end, offsets[text], slopes[text], dots)
-            for p in range(end - begin):
-                dots[p] /= length[begin + p]
+            if len(length):
+                for p in range(end - begin):
+                    dots[p] /= length[begin + p]
             _write_relevancy(dots, generic[begin:end], scale, out[text, begin - first : end - first])
 
 

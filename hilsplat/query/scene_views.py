@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.errors import SettingsError, nearest
-from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.levels import LEVELS, NONE, Level, spelt
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.scene import Scene
@@ -100,9 +100,9 @@ class SceneViews:
         """Return the camera of a view; raise SettingsError if the scene has no such view."""
         if isinstance(view, Camera):
             return view
-        if view not in self.names:
+        if (name := spelt(view, self.names)) is None:
             raise SettingsError(f"{self.scene.name} has no view {view!r}", expected=nearest(view, self.names))
-        return self.scene.cameras[view]
+        return self.scene.cameras[name]
 
     def cached(self, kind: str, view: View, compute: Callable[[], Any], *more: Any) -> Any:
         """Return the cached result for a view of the scene; those of other cameras aren't cached."""
@@ -110,7 +110,7 @@ class SceneViews:
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
         """Return a view's undistorted photograph, a cached read-only array: copy it to change pixels."""
-        self.camera(view)
+        view = self.camera(view).name
 
         def read() -> np.ndarray:
             pixels = self.scene.image(view)

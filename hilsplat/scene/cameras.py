@@ -10,6 +10,7 @@ from jaxtyping import Float, Int32
 from hilsplat.base.arrays import require_arrays, require_types
 from hilsplat.base.artifacts import damaged, read_npz, write_npz
 from hilsplat.base.errors import SceneError, shorten_list
+from hilsplat.base.levels import spelt
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
 MAX_SIDE_PX = 2**15
@@ -113,7 +114,11 @@ class Cameras:
     def __getitem__(self, view: str | int) -> Camera:
         """Return the camera of a view, by name or row; raise SceneError if there is none."""
         try:
-            row = self.names.index(view) if isinstance(view, str) else range(len(self))[view]
+            row = (
+                self.names.index(spelt(view, self.names) or view)
+                if isinstance(view, str)
+                else range(len(self))[view]
+            )
         except (ValueError, IndexError) as error:
             raise SceneError(
                 f"view {view!r} has no camera",

@@ -56,6 +56,7 @@ class FinishedScene:
         Input paths are read from provenance; without it, each is expected beside the artifact made from it. A
         variant may share the field recorded in the provenance of its scores. During a run, the variant's own
         CLIP vectors are sufficient. Until `default` has any, those of the key views are used, with a warning.
+        While a run rebuilds the scene, what it has already made precedes what is left of the previous run.
 
         Raises:
             ArtifactError: the folder, the variant or a part is missing.
@@ -66,18 +67,18 @@ class FinishedScene:
         field = _recorded_input(scores, "field", folder) or new
         if field != new and new.exists() and new.stat().st_mtime > provenance_path(scores).stat().st_mtime:
             field = new  # it is not scored yet
-        clip = folder / variant / "clip"
-        if variant == "default" and not (clip.exists() or field.exists()):
-            early = folder / KEY_VIEWS / "clip"
-            if early.exists():
-                clip = early
-                logger.warning("%s", refining(folder))
+        own, early = (folder / name / "clip" for name in (variant, KEY_VIEWS))
+        usable = [field, own, *([early] if variant == "default" else [])]
+        made = [path for path in usable if path.exists()]
+        if not made:  # `default` has its own vectors; other variants may share them
+            raise _unfinished(folder, own if variant == "default" else field)
+        clip = next((path for path in made if not changed_input(path, folder)), made[0])
         autoencoder = None
-        if field.exists():
+        if clip == field:
             autoencoder = input_of(field, "autoencoder", folder)
             clip = input_of(autoencoder, "clip", folder)
-        elif not clip.exists():  # `default` has its own vectors; other variants may share them
-            raise _unfinished(folder, clip if variant == "default" else field)
+        elif clip != own:
+            logger.warning("%s", refining(folder))
         tree = input_of(autoencoder or clip, "semantic_tree", folder)
         used_field, masks = field if autoencoder else None, input_of(clip, "masks", folder)
         gaussians = folder / "gaussians.ply"
@@ -110,7 +111,7 @@ class FinishedScene:
 
 def scenes_in(results: Path) -> list[str]:
     """Return the names, `<dataset>/<scene>`, of the scenes of a results folder that have poses."""
-    places = [path for path in results.glob("*/*") if (path / "scene" / INDEX).is_file()]
+    places = [path.parents[1] for path in results.glob(f"*/*/scene/{INDEX}")]  # skips unreadable folders
     return sorted(f"{path.parent.name}/{path.name}" for path in places)
 
 
@@ -124,10 +125,16 @@ def command_name(folder: Path) -> str:
     return str(folder.relative_to("results") if folder.parts[0] == "results" else folder)
 
 
+def holds_scenes(folder: Path) -> bool:
+    """Return whether a folder is or has scenes, as a folder of photographs with a scene's name has not."""
+    return any(any(folder.glob(place)) for place in ("scene", "*/scene", "*/*/scene"))
+
+
 def require_scene_folder(folder: Path) -> None:
     """Raise ArtifactError, with known scenes, if a folder does not exist or contains scenes."""
     around = folder.absolute().parent
-    inside = scenes_in(folder) or matching_scenes(scenes_in(around), f"{folder.name}/*")
+    below = [f"{folder.name}/{path.parents[1].name}" for path in folder.glob(f"*/scene/{INDEX}")]
+    inside = scenes_in(folder) or sorted(below)
     if folder.is_dir() and not inside:
         return
     known = inside or scenes_in(around) or scenes_in(around.parent)  # results/desk, or results/photos/desk

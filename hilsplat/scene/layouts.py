@@ -3,7 +3,7 @@
 import re
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -202,11 +202,27 @@ def largest_copies(images: Sequence[Path]) -> list[Path]:
 
 def contents(folder: Path) -> str:
     """Return what a folder without usable photographs contains, for messages."""
-    kinds = Counter(file.suffix.lower() or "no suffix" for file in folder.iterdir() if file.is_file())
-    items = [f"{count} files ({kind})" for kind, count in sorted(kinds.items())]
-    places = Counter(path.parent for path in images_below(folder) if path.parent != folder)
-    items += [f"{count} images in {below}/" for below, count in sorted(places.items())]
+    away = placeholders(folder)
+    files = (file for file in folder.iterdir() if file.is_file() and file not in away)
+    kinds = Counter(file.suffix.lower() or "no suffix" for file in files)
+    items = [f"{len(away)} photographs that {NOT_DOWNLOADED}"] if away else []
+    items += [f"{count} files ({kind})" for kind, count in sorted(kinds.items())]
+    items += counted_by_folder(path for path in images_below(folder) if path.parent != folder)
     return ", ".join(items[:8]) or "nothing"
+
+
+NOT_DOWNLOADED = "iCloud has not downloaded (download them in Finder first)"
+
+
+def placeholders(folder: Path) -> list[Path]:
+    """Return the hidden files that replace photographs in iCloud only, such as `.IMG_1.HEIC.icloud`."""
+    return sorted(folder.glob(".*.icloud"))
+
+
+def counted_by_folder(images: Iterable[Path]) -> list[str]:
+    """Return the number of images in each folder, for messages."""
+    places = Counter(path.parent for path in images)
+    return [f"{count} images in {below}/" for below, count in sorted(places.items())]
 
 
 def has_known_poses(folder: Path, named: Path | None = None) -> bool:
@@ -348,7 +364,10 @@ def photo_files(folder: Path, named: Path | None = None) -> list[Path]:
     """Return the files in a source folder that `poses` reads: photographs, and the files of known poses.
 
     Poses may refer to any image below the folder. Folders that hilsplat wrote and `UNUSED` ones are skipped.
+    A missing folder, as of a disk that isn't connected, has none.
     """
+    if not folder.is_dir():
+        return []
     try:
         known = find_known_poses(folder, named)
     except SceneError:  # `poses` reports it

@@ -1,7 +1,9 @@
 """What was drawn on a photograph (labels, masks, maps), at the pixels of the view made from it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int64, Shaped
@@ -14,7 +16,21 @@ SHAPE_TOLERANCE = 0.01
 
 OUTSIDE = -1
 
+ON_VIEW = {"drawn_on": "view"}
+"""Key of files whose drawings are on the view. Their size can fit the photograph better once the lens has
+been estimated again, because the view's size then changes by about a pixel."""
+
 Placement = Callable[[Shaped[np.ndarray, "H W"]], Shaped[np.ndarray, "h w"]]
+
+
+def is_on_view(content: Mapping[str, Any]) -> bool:
+    """Return whether a file states that its drawings are on the view (`ON_VIEW`)."""
+    return ON_VIEW.items() <= content.items()
+
+
+def of_view(camera: Camera) -> Camera:
+    """Return a view's camera without its photograph, for drawings that are on the view or a scaled copy."""
+    return replace(camera, photo=None)
 
 
 def placement(camera: Camera, drawn_hw: tuple[int, int], where: str) -> Placement | None:

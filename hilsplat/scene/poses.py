@@ -12,15 +12,30 @@ import numpy as np
 
 from hilsplat.base.artifacts import run_command
 from hilsplat.base.atomic import work_folder
-from hilsplat.base.errors import RegistrationError, SceneError, shorten_list
+from hilsplat.base.errors import ImageError, RegistrationError, SceneError, first_line, shorten_list
 from hilsplat.base.files import list_images
 from hilsplat.base.images import image_size_hw, read_image, resize_to_fit
+from hilsplat.base.lineage import copies_of
 from hilsplat.base.ownership import SOFTWARE, require_own_picture
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import stage_log
 from hilsplat.base.removal import delete
-from hilsplat.scene.assemble import Posed, PosedView, few_points_doubt, split_views, write_scene
-from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
+from hilsplat.scene.assemble import (
+    Posed,
+    PosedView,
+    few_points_doubt,
+    pinhole_of,
+    split_views,
+    write_scene,
+)
+from hilsplat.scene.colmap import (
+    camera_of,
+    is_pinhole,
+    pose_matrix,
+    pycolmap,
+    reprojection_errors,
+    sparse_points,
+)
 from hilsplat.scene.features import (
     MIN_INLIERS,
     WorkImage,
@@ -51,6 +66,11 @@ TITLE_LETTERS = 48
 """Letters in a line of a picture's title; longer lines would run into the title of the next picture."""
 
 THUMBNAIL_PX = 400
+
+LENS_ADVICE = (
+    "the estimated distortion of a lens cannot be undone: set poses.camera_model: opencv, or film with a "
+    "linear field of view"
+)
 
 ADVICE = (
     "Take more photographs between each of these and its neighbours on the right, less than 10 degrees "
@@ -129,6 +149,8 @@ def _reconstruct(
             f"image folder {images} of {name} is missing", fix="correct the scene's source in the scene sheet"
         )
     sources = list_images(photo_folder(images))
+    copies = copies_of(sources)  # a copy of a training view would be no test
+    sources = [source for source in sources if source not in copies]
     if len(sources) < MIN_PHOTOS:
         raise SceneError(
             f"{images} of {name} has too few images to find camera poses",
@@ -150,7 +172,8 @@ def _reconstruct(
     shared, counts = count_matches(database)
     logger.info("%s: %s mapping", name, settings.mapper)
     models = map_views(database, work / "images", work / "models", settings.mapper, seed)
-    report = registration_report(work_images, counts, models)
+    bent = bent_views(models[0], settings.max_side_px) if models else {}
+    report = registration_report(work_images, counts, models, bent)
     name_neighbours(shared, report["views"])
     how = f"structure from motion, {settings.mapper} mapper, {matcher} matching, {camera_model}"
     report = {"scene": name, "poses": how, "seed": seed, **report}
@@ -158,26 +181,52 @@ def _reconstruct(
     report["images"] += len(unreadable)
     for photo in work_images:
         report["views"][photo.view]["photo_hw_px"] = image_size_hw(photo.source, upright=True)
-    for source, reason in unreadable.items():
+    for source, reason in (
+        unreadable | {copy: f"a copy of {of.name}" for copy, of in copies.items()}
+    ).items():
         lost = {"file": source.name, "registered": False, "why_not": reason.splitlines()[0]}
         report["views"].setdefault(source.name, lost)
     check_registration(images, out, name, report, settings)
     model, views = models[0], []
-    for image in (model.images[image_id] for image_id in model.reg_image_ids()):
+    for image in registered_images(model):
+        if image.name in bent:
+            continue
         pose, file = pose_matrix(image.cam_from_world()), work / "images" / image.name
         views.append(PosedView(image.name, file, camera_of(image), pose))
     split = split_views([view.view for view in views], settings.test_every)
     return views, sparse_points(model), split, report
 
 
+def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return [model.images[image_id] for image_id in model.reg_image_ids()]
+
+
+def bent_views(model: pycolmap.Reconstruction, max_side_px: int) -> dict[str, str]:
+    """Return why views of a model cannot be undistorted by their estimated lens (`pinhole_of`), by view."""
+    reasons = {}
+    for image in registered_images(model):
+        lens = camera_of(image)
+        try:
+            if not is_pinhole(lens):
+                pinhole_of(image.name, lens, max_side_px)
+        except ImageError as error:
+            reasons[image.name] = first_line(error)
+    return reasons
+
+
 def registration_report(
     images: Sequence[WorkImage],
     matches: Mapping[str, Mapping[str, int]],
     models: Sequence[pycolmap.Reconstruction],
+    bent: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return the registration report: totals, models, and each view's matches and outcome."""
+    """Return the registration report: totals, models, and each view's matches and outcome.
+
+    Views in `bent` count as unregistered, for the given reason (`bent_views`).
+    """
     errors = reprojection_errors(models[0]) if models else {}
-    members = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
+    errors = {view: px for view, px in errors.items() if view not in bent}
+    members = [{image.name for image in registered_images(model)} for model in models]
     groups = Counter(entry["group"] for entry in matches.values())
     main_group = max(groups, key=lambda group: sum(matches[view]["group"] == group for view in errors))
     views: dict[str, Any] = {}
@@ -190,7 +239,9 @@ def registration_report(
             entry["observations"] = len(px)
             entry["reprojection_error_px"] = round(float(px.mean()), 4) if len(px) else None
         else:
-            entry["why_not"] = _why_not(image.view, entry, groups, main_group, members)
+            entry["why_not"] = bent.get(image.view) or _why_not(
+                image.view, entry, groups, main_group, members
+            )
         views[image.view] = entry
     every_error = np.concatenate([*errors.values(), np.zeros(0)])
     num_points = models[0].num_points3D() if models else 0
@@ -198,6 +249,7 @@ def registration_report(
     warnings = []
     if 0 < len(errors) < len(images):
         warnings.append(f"{len(images) - len(errors)} of {len(images)} views are not registered")
+    warnings += [LENS_ADVICE] if bent else []
     separate = [size for _, size in sorted(groups.items()) if size >= MIN_PHOTOS]
     if len(separate) > 1:
         warnings.append(groups_question(separate))
@@ -222,7 +274,7 @@ def registration_report(
 
 def _camera_entries(model: pycolmap.Reconstruction) -> list[dict[str, Any]]:
     """Return the estimated lens parameters, before undistortion."""
-    used = sorted({model.images[image_id].camera_id for image_id in model.reg_image_ids()})
+    used = sorted({image.camera_id for image in registered_images(model)})
     return [
         {
             "model": camera.model_name,
@@ -313,6 +365,8 @@ def check_registration(
             "add sharp photographs of textured surfaces between the unregistered ones and the others "
             "(neighbours less than about 10 degrees apart), or remove the unregistered ones from the folder"
         )
+    if LENS_ADVICE in report["warnings"]:
+        advice = f"{LENS_ADVICE}; otherwise, {advice}"
     if registered:
         enough = {"min_registered_share": float(np.floor(share * 100) / 100)}
         command = run_command(out, scene=name, settings={"poses": enough})

@@ -92,7 +92,7 @@ def project_root(sheet: Path) -> Path:
 
 
 def read_sheet(
-    path: Path, checked_groups: Collection[str] | None = None, data_root: str = "", *, text: str | None = None
+    path: Path, checked: Collection[str] | None = None, data_root: str = "", *, text: str | None = None
 ) -> list[SceneRow]:
     """Read and check the scene sheet: tab-separated, with one header line and `#` for comment lines.
 
@@ -100,8 +100,8 @@ def read_sheet(
     cell or "-" has the same meaning.
 
     Args:
-        checked_groups: groups whose source folders must exist and contain images; None for all. A run checks
-            only the groups it runs, so that a missing folder in a different group does not stop it.
+        checked: scenes, `dataset/scene`, whose source folders must exist and contain images; None for all. A
+            run checks only its own scenes, so that the missing folder of another does not stop it.
         data_root: folder of the published data sets, to which `data:` sources are relative (they need not
             exist); empty if not set.
         text: content that will be written to the sheet; None to read the sheet.
@@ -128,7 +128,7 @@ def read_sheet(
                 found=f"{len(cells)}: {text!r}",
                 fix="separate columns with one tab; only optional columns at the end may be missing",
             )
-        row = _row(path, line, dict(zip(header, cells, strict=True)), checked_groups, data_root)
+        row = _row(path, line, dict(zip(header, cells, strict=True)), checked, data_root)
         # Names that differ only in case would share a folder on some file systems.
         if (key := row.name.casefold()) in line_of:
             raise SceneError(
@@ -236,7 +236,7 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
 
 
 def _row(
-    path: Path, line: int, cells: dict[str, str], checked_groups: Collection[str] | None, data_root: str
+    path: Path, line: int, cells: dict[str, str], checked: Collection[str] | None, data_root: str
 ) -> SceneRow:
     def fault(column: str, problem: str, fix: str, **lines: str) -> SceneError:
         return SceneError(f"{path}, line {line}, column {column}: {problem}", fix=fix, **lines)
@@ -271,7 +271,7 @@ def _row(
         features=optional("features"),
         poses=NO_POSES if cells.get("poses") == str(NO_POSES) else optional("poses"),
     )
-    if checked_groups is None or row.group in checked_groups:
+    if checked is None or row.name in checked:
         _check_files(row, cells, fault)
     return row
 

@@ -112,13 +112,14 @@ def view_names(sources: Sequence[Path]) -> list[str]:
             else name
             for name, prefix, source in zip(names, prefixes, sources, strict=True)
         ]
-    for name, count in Counter(names).items():
-        if count > 1:
-            same = [source for source, other in zip(sources, names, strict=True) if other == name]
-            folder = os.path.commonpath([source.parent for source in same])
-            raise SceneError(
-                f"{count} images in {folder} have the same view name {name}",
-                found=", ".join(os.path.relpath(source, folder) for source in same),
-                fix="rename or remove all but one: views are named after the file without its suffix",
-            )
+    if shared := {name: count for name, count in Counter(names).items() if count > 1}:
+        name, count = next(iter(shared.items()))
+        same = [source for source, other in zip(sources, names, strict=True) if other == name]
+        folder = os.path.commonpath([source.parent for source in same])
+        others = f", and so on for {len(shared)} names" if len(shared) > 1 else ""
+        raise SceneError(
+            f"{count} images in {folder} have the same view name {name}{others}",
+            found=", ".join(os.path.relpath(source, folder) for source in same),
+            fix="rename or remove all but one of each: views are named after the file without its suffix",
+        )
     return names

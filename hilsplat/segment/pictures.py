@@ -11,7 +11,7 @@ from matplotlib.colors import hsv_to_rgb
 from hilsplat.base.artifacts import read_index, read_npz, sealed
 from hilsplat.base.errors import ArtifactError, nearest
 from hilsplat.base.images import write_png
-from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.levels import LEVELS, NONE, Level, spelt
 from hilsplat.base.ownership import SOFTWARE, require_own_picture
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.crops import square_crop
@@ -136,9 +136,8 @@ def masks_overview(
     for path in (out_png, *([tree_png] if tree_folder else [])):
         require_own_picture(path)
     views = list(read_index(masks_folder)["views"])
-    chosen = view or views[len(views) // 2]
-    if chosen not in views:
-        raise ArtifactError(f"{masks_folder} has no view {chosen!r}", expected=nearest(chosen, views))
+    if (chosen := spelt(view or views[len(views) // 2], views)) is None:
+        raise ArtifactError(f"{masks_folder} has no view {view!r}", expected=nearest(str(view), views))
     masks = HierarchicalMasks.load(masks_folder / f"{chosen}.npz")
     image = Scene.load(scene_folder).image(chosen)
     write_png(out_png, masks_picture(image, masks), text=SOFTWARE)

@@ -25,7 +25,7 @@ from hilsplat.models import int8
 from hilsplat.models.card import CPU, Batches, in_turn, network_device
 from hilsplat.models.folder import SAM_SIDE_PX, ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.layouts import DECODER, PREVIEW
-from hilsplat.models.memory import needs_of
+from hilsplat.models.memory import card_mib
 from hilsplat.models.network import Array, Network, on_host, or_as_exported
 from hilsplat.models.onnx_graph import Graph, with_rowwise_attention
 from hilsplat.models.repeatable import random_pixels, require_repeatable_once
@@ -218,7 +218,7 @@ class SamModel:
         """
         fix = "set masks.segmenter: graph, which needs no model"
         model = open_model_folder(folder, "sam", variant=variant, fix=fix)
-        return SamModel(model, network_device(device, "masks", needs_of(model, 1, as_exported=True).card_mib))
+        return SamModel(model, network_device(device, "masks", card_mib(model)))
 
     def thresholds(self, settings: MasksSettings) -> Thresholds:
         """Return the settings' thresholds, with the model's own in place of `auto`."""

@@ -122,7 +122,13 @@ def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> floa
 
 @explained_memory(MEMORY_USER, MEMORY_FIX)
 def fit_gaussians(
-    scene: Scene, settings: GaussiansSettings, *, seed: int, threads: int = 1, checkpoint: Path | None = None
+    scene: Scene,
+    settings: GaussiansSettings,
+    *,
+    seed: int,
+    threads: int = 1,
+    checkpoint: Path | None = None,
+    device: Device | None = None,
 ) -> tuple[Gaussians, Float64[np.ndarray, "S 4"]]:
     """Fit Gaussians to the training views of a scene.
 
@@ -133,6 +139,7 @@ def fit_gaussians(
         seed: determines the view order, splits, relocations, noise and random points.
         checkpoint: file to which the state is written every `checkpoint_every` steps, and from which
             an interrupted fit with the same inputs resumes; removed at the end.
+        device: device to use; by default, the result of `fit_device`.
 
     Returns:
         The Gaussians in Morton order (frozen ones in the order of their points), and the
@@ -145,7 +152,7 @@ def fit_gaussians(
     views = load_views(scene, "train", settings.image_scale)
     if not views:
         raise SceneError(f"{scene.name} has no training views", fix="hold out fewer views (poses.test_every)")
-    model_class = model_on(fit_device(scene, settings))
+    model_class = model_on(device or fit_device(scene, settings))
     settings = settings.model_copy(update={"iterations": fit_steps(settings, len(views))})
     cameras = [view.camera for view in views]
     extent = camera_extent(cameras)
@@ -305,12 +312,12 @@ def run_gaussians(
             gaussians, origin = import_gaussians(existing, scene, dataparser, transforms)
         else:
             # a fit must resume on the same device, because sums differ between CPU and CUDA
-            settings = settings.model_copy(update={"device": fit_device(scene, settings)})
-            inputs = [settings.model_dump(mode="json"), seed, sha256_of_path(scene_folder)]
-            key = sha256_of_json([*inputs, code_digest(fit_gaussians)])
+            device = fit_device(scene, settings)
+            values = settings.model_dump(mode="json") | {"device": device}
+            key = sha256_of_json([values, seed, sha256_of_path(scene_folder), code_digest(fit_gaussians)])
             checkpoint = Path(cache) / "gaussians" / f"{key[:16]}.npz"
             gaussians, curve = fit_gaussians(
-                scene, settings, seed=seed, threads=threads, checkpoint=checkpoint
+                scene, settings, seed=seed, threads=threads, checkpoint=checkpoint, device=device
             )
             origin = {
                 "kind": "fitted",

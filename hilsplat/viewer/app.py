@@ -84,7 +84,6 @@ class Viewer:
             tree, version = shown.parts(asked.variant).semantic_tree, server.version_sent(request)
             with shown.unchanged():  # otherwise nodes of a rebuilt tree could get the names
                 names = write_names(shown.folder, tree, asked.names, len(scene.tree), version)
-            shown.rename(tree, names)
             return {"version": names.version, "names": dict(names.of_node)}
 
         return server.answer(await self.thread.do(request, write))

@@ -16,7 +16,7 @@ from hilsplat.base.images import to_uint8
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.query.language_scene import LanguageScene
-from hilsplat.query.names import NodeNames, tree_digest
+from hilsplat.query.names import FILE, read_names, tree_digest
 from hilsplat.query.scene_state import SceneState
 from hilsplat.query.scene_views import Opened
 from hilsplat.scene.finished import (
@@ -36,6 +36,7 @@ from hilsplat.splat.spz import fractional_bits, spz_bytes
 from hilsplat.viewer import payload
 from hilsplat.viewer.frames import Paint, faded, painted, pick
 from hilsplat.viewer.wire import MAX_GAUSSIANS, MAX_NODES, Style, rows_of
+from hilsplat.web.file_changes import version_of
 from hilsplat.web.scene_thread import ShownScene
 
 VIEWS_MIB = 256.0  # memory limit for cached per-view results, such as compositing weights
@@ -113,7 +114,7 @@ class ViewerScene(ShownScene):
         return scenes
 
     def news(self) -> dict[str, Any]:
-        names = {variant: scene.names.version for variant, (_, scene) in list(self._variants.items())}
+        names = dict.fromkeys(list(self._variants), version_of(self.folder / FILE))
         return {**super().news(), "variants": self.variants, "names": names}
 
     @property
@@ -131,8 +132,9 @@ class ViewerScene(ShownScene):
             HilsplatError: a part cannot be opened.
         """
         field = self.folder / variant / "field.safetensors"
-        _, scene = self._variants.get(variant, (None, None))
-        if scene is None or (scene.decoded_field is None and field.exists()):
+        known = self._variants.get(variant)
+        is_new = known is not None and known[1].decoded_field is None and field.exists()
+        if known is None or (is_new and FinishedScene.locate(self.folder, variant).parts != known[0]):
             if variant not in self.variants:  # reject anything but listed names, such as paths
                 raise SettingsError(
                     f"variant {variant!r} cannot be queried here",
@@ -149,18 +151,16 @@ class ViewerScene(ShownScene):
                     found=f"{len(scene.tree)}",
                     fix="query the scene with hilsplat query, or raise semantic_tree.min_views",
                 )
-            self._variants[variant] = finished.parts, scene
+            known = finished.parts, scene
+        parts, scene = known
+        if scene.names.version != version_of(self.folder / FILE):  # another variant, or another program
+            with self.unchanged():  # otherwise nodes of the opened tree could get names of a rebuilt one
+                scene = replace(scene, names=read_names(self.folder, parts.semantic_tree))
+        self._variants[variant] = parts, scene
         return scene
 
     def parts(self, variant: str) -> SceneParts:
         return self._variants[variant][0]
-
-    def rename(self, semantic_tree: Path, names: NodeNames) -> None:
-        """Use new names in every variant with this tree."""
-        for variant, (parts, scene) in list(self._variants.items()):
-            # Don't use `answering`: reopening a variant could fail after the names are written.
-            if parts.semantic_tree.resolve() == semantic_tree.resolve():
-                self._variants[variant] = parts, replace(scene, names=names)
 
     def described(self) -> dict[str, Any]:
         state = {"variants": self.variants, "of": self.state}

@@ -45,7 +45,7 @@ class ShownScene:
 
     def __init__(self) -> None:
         self.state = ""
-        self._seen: dict[Path, tuple[int, int, int] | None] = {}
+        self._seen: dict[Path, tuple[int, int] | None] = {}
 
     def identify(self, parts: Iterable[Path]) -> None:
         """Derive `state` from the current state of all parts that exist."""
@@ -91,12 +91,12 @@ class ShownScene:
         raise NotImplementedError
 
 
-def _state_of(part: Path) -> tuple[int, int, int] | None:
+def _state_of(part: Path) -> tuple[int, int] | None:
     try:
         file = (part / INDEX if part.is_dir() else part).stat()
     except OSError:
         return None
-    return file.st_ino, file.st_size, file.st_mtime_ns
+    return file.st_size, file.st_mtime_ns  # on exFAT, a file can get another inode number
 
 
 Shown = TypeVar("Shown", bound=ShownScene)

@@ -14,7 +14,7 @@ from typing import Literal
 from packaging.requirements import Requirement
 
 from hilsplat.base.atomic import existing_folder
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.errors import HilsplatError, MemoryLimitError, in_one_line
 from hilsplat.base.lineage import version_of
 from hilsplat.base.memory import machine_mib
 from hilsplat.configuration import merged_config
@@ -69,13 +69,15 @@ def libraries() -> Iterator[Finding]:
 
 def cuda() -> Iterator[Finding]:
     """Check whether torch and gsplat can use CUDA, and whether their renders match the CPU's."""
+    from hilsplat.models.card import card_problem
     from hilsplat.splat.rasterise.device import cuda_problem, forget_cuda, kernel_problem
     from hilsplat.splat.rasterise.parity import cuda_disagreement
 
     forget_cuda()
     if problem := cuda_problem() or kernel_problem():
+        what = "everything runs" if card_problem() else "fits and contributions run"
         fix = "on a machine with an NVIDIA GPU: install the extra gpu and a CUDA toolkit (docs/gpu.md)"
-        yield Finding("cuda", "note", f"{problem}: everything runs on the CPU", fix)
+        yield Finding("cuda", "note", f"{problem}: {what} on the CPU", fix)
         return
     sound = "gsplat and the CPU agree on a step of a fit and pixel weights"
     yield verdict("cuda", cuda_disagreement(), sound, "set device: cpu, and report this output")
@@ -118,6 +120,10 @@ def models() -> Iterator[Finding]:
         try:
             check_model(folder)
             apart = None if card_problem() else card_disagreement(folder)
+        except MemoryLimitError as error:
+            problem = f"{folder} works on the CPU, but not on the GPU now: {in_one_line(error)}"
+            yield Finding("models", "note", problem, "end other programs on the GPU, or use a smaller model")
+            continue
         except HilsplatError as error:
             yield Finding("models", "fault", str(error), f"hilsplat models get {shlex.quote(folder.name)}")
             continue

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from hilsplat.base.tables import aligned_table
 from hilsplat.models.store import read_model
@@ -108,16 +108,20 @@ def _row(name: str, jobs: Sequence[JobEstimate], cores: int, scale: float) -> tu
 
 
 def forecasts(plan: Plan, cores: int) -> list[str]:
-    """Return a line for each photograph scene that full-size SAM and CLIP models have not yet processed."""
-    resources = JobResources(plan)
+    """Return a line for each photograph scene that full-size SAM and CLIP models have not yet processed.
+
+    Networks are measured on the CPU, unless their jobs get a card; then their seconds are those of `GPU`.
+    """
+    resources = JobResources(plan, cores)
     lines = []
     for row in plan.scenes:
         stages = plan.stages(row)
         models = [read_model(Path(section.model)) for section in (stages.masks, stages.clip)]
         full = stages.masks.segmenter == "sam" and all(model and not model.embedded for model in models)
-        if row.group == PHOTOS and full and not Path(plan.path(row, "default", "clip")).exists():
+        is_new = row.features is None and not Path(plan.path(row, "default", "clip")).exists()
+        if row.group == PHOTOS and full and is_new:
             lines.append(_forecast(plan, resources, row, cores))
-    return lines
+    return [*lines, NOTES[1]] if any("the GPU" in line for line in lines) else lines
 
 
 def _forecast(plan: Plan, resources: JobResources, row: SceneRow, cores: int) -> str:
@@ -125,29 +129,49 @@ def _forecast(plan: Plan, resources: JobResources, row: SceneRow, cores: int) ->
 
     num_photos, stages = resources.size(row).views, plan.stages(row)
     sam, clip, cache = stages.masks, stages.clip, plan.results / ".cache"
-    view_s = seconds_of(Path(sam.model), sam.variant, sam.precision, cache)
-    crop_s = seconds_of(Path(clip.model), clip.variant, clip.precision, cache)["crop"]
-    prompt_s = view_s["masks"]
-    if "preview" in view_s:
-        prompt_s = view_s["preview"] + KEPT_PROMPTS * view_s["masks"]
+    fit_on_card, sam_on_card, clip_on_card = (
+        bool(resources.gpus(rule)(row)) for rule in ("gaussians", "masks", "clip")
+    )
+    measured = {} if sam_on_card else seconds_of(Path(sam.model), sam.variant, sam.precision, cache)
+
+    def photo_s(job: Any, share: float = 1.0) -> float:
+        """Return SAM's seconds per photograph: on a card, or on a core with a share of the grid's prompts."""
+        masks = plan.stages(job).masks
+        if sam_on_card:
+            return (resources.card_seconds("masks", job) or 0.0) / (num_photos * masks.key_views)
+        prompt_s = measured["masks"]
+        if "preview" in measured:
+            prompt_s = measured["preview"] + KEPT_PROMPTS * measured["masks"]
+        return measured["image"] + PICTURE_S + share * masks.points_per_side**2 * prompt_s
+
+    crop_s = GPU["clip_crop_s"]
+    if not clip_on_card:
+        crop_s = seconds_of(Path(clip.model), clip.variant, clip.precision, cache)["crop"]
+    photos_at_once, crops_at_once = (1 if on_card else cores for on_card in (sam_on_card, clip_on_card))
     every = stages.poses.test_every
     views = num_photos - (num_photos // every if every else 0)
-    prompts = stages.masks.points_per_side**2
-    base_s = view_s["image"] + PICTURE_S
-    full_s, guided_s = base_s + prompts * prompt_s, base_s + GUIDED * prompts * prompt_s
-    before_s = sum(resources.core_seconds(rule, row) for rule in ("poses", "gaussians"))
+    fit_s = resources.core_seconds("gaussians", row) / cores
+    if fit_on_card:
+        fit_s = resources.card_seconds("gaussians", row) or 0.0
+    before_s = resources.core_seconds("poses", row) / cores + fit_s
     linking = plan.identity("semantic_tree", "default", *plan.situation(row)).stages
     after_s = sum(resources.core_seconds(name, row) for name in linking if stage_of(name).artifact != "masks")
-    first_answer, rest_s = "", views * full_s
+    after_s /= cores
+    crops_s = NODES * crop_s / crops_at_once  # for one crop per node
+    first_answer, rest_s = "", views * photo_s(row) / photos_at_once
     if plan.first_answer(of_variant(row, "default")):
-        settings = plan.stages(of_variant(row, KEY_VIEWS))
+        key = of_variant(row, KEY_VIEWS)
+        settings = plan.stages(key)
         first = views * settings.masks.key_views
-        key_s = base_s + settings.masks.points_per_side**2 * prompt_s
-        before_s += first * key_s + after_s / 2 + NODES * settings.clip.crops_per_node * crop_s
-        rest_s = (views - first) * (guided_s if stages.masks.prompts == "guided" else full_s)
-        first_answer = f"first answer in {duration(before_s / cores)}, "
-    total_s = before_s + rest_s + after_s + NODES * stages.clip.crops_per_node * crop_s
+        before_s += first * photo_s(key) / photos_at_once + after_s / 2
+        before_s += settings.clip.crops_per_node * crops_s
+        share = GUIDED if sam.prompts == "guided" else 1.0
+        rest_s = (views - first) * photo_s(row, share) / photos_at_once
+        first_answer = f"first answer in {duration(before_s)}, "
+    total_s = before_s + rest_s + after_s + clip.crops_per_node * crops_s
+    core = f"one of {cores} cores"
     return (
-        f"{row.name}: {first_answer}all photographs in {duration(total_s / cores)}. "
-        f"On one of {cores} cores, SAM takes {full_s:.0f} s per photograph, and CLIP {crop_s:.2f} s per crop."
+        f"{row.name}: {first_answer}all photographs in {duration(total_s)}. "
+        f"SAM takes {photo_s(row):.1f} s per photograph on {'the GPU' if sam_on_card else core}, "
+        f"and CLIP {crop_s:.2g} s per crop on {'the GPU' if clip_on_card else core}."
     )

@@ -19,6 +19,7 @@ from hilsplat.base.images import image_size_hw, read_image, to_uint8
 from hilsplat.base.lineage import visible_files
 from hilsplat.configuration import StageSettings
 from hilsplat.datasets.images.hi import annotated_regions
+from hilsplat.datasets.labelled import LabelledRegion
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.langsplat_files import read_view, read_views, require_model
 from hilsplat.scene import layouts
@@ -28,7 +29,7 @@ from hilsplat.scene.colmap import is_pinhole
 from hilsplat.scene.importers.importing import fitted_camera, misfit_notes
 from hilsplat.scene.importers.known_views import KnownView
 from hilsplat.scene.importers.reading import read_source
-from hilsplat.scene.placement import placement
+from hilsplat.scene.placement import of_view, placement
 from hilsplat.scene.view_names import match_names, view_names
 from hilsplat.splat.coordinates import read_gaussians, source_from_ply
 from hilsplat.splat.gaussians import base_rgb
@@ -116,7 +117,14 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
         _name_unused([*models, *below], "to use these poses, pass --poses", parts)
         unread = [path for pattern in UNREAD_POSES for path in folder.glob(pattern)]
         _name_unused(unread, "for poses, export a COLMAP model or transforms.json", parts)
-        photos = list_images(layouts.photo_folder(folder))
+        photos = list_images(chosen := layouts.photo_folder(folder))
+        others = [
+            path for path in layouts.largest_copies(layouts.used_images(folder)) if path.parent != chosen
+        ]
+        if counts := layouts.counted_by_folder(others):
+            parts.lines.append(f"  not used: {shorten_list(counts, 5)}; to use them, move them to {chosen}")
+        if away := layouts.placeholders(chosen):
+            parts.lines.append(f"  left out: {len(away)} photographs that {layouts.NOT_DOWNLOADED}")
         return Views(dict(zip(view_names(photos), photos, strict=True)))
     source, views, max_side_px = read_source(known), Views(), settings.poses.max_side_px
     with_image = {view.image: view for view in source.views if view.image is not None}
@@ -235,7 +243,7 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
         else:
             try:
                 if regions := annotated_regions(path, warnings):
-                    warnings += _shape_notes(views, view, regions[0].size_hw, path)
+                    warnings += _shape_notes(views, view, regions[0], path)
                 num_regions, parts.labels[path] = num_regions + len(regions), copy
             except HilsplatError as error:
                 lost.append(in_one_line(error))
@@ -251,7 +259,7 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
     parts.lines += [f"  {shorten_list(warnings, 5)}"] if warnings else []
 
 
-def _shape_notes(views: Views, view: str, drawn_hw: tuple[int, int], path: Path) -> list[str]:
+def _shape_notes(views: Views, view: str, region: LabelledRegion, path: Path) -> list[str]:
     """Return a note on labels that can only fit the undistorted view, whose shape is not yet known.
 
     Raises:
@@ -259,8 +267,9 @@ def _shape_notes(views: Views, view: str, drawn_hw: tuple[int, int], path: Path)
     """
     if (camera := views.cameras.get(view)) is None:
         camera = Camera(view, np.eye(4), np.eye(3), image_size_hw(views.photos[view], upright=True))
+    drawn_hw = region.size_hw
     try:
-        placement(camera, drawn_hw, f"label file {path}")
+        placement(of_view(camera) if region.on_view else camera, drawn_hw, f"label file {path}")
     except MisalignedArtifactError as error:
         misfit = abs(drawn_hw[0] * camera.size_hw[1] / (drawn_hw[1] * camera.size_hw[0]) - 1)
         if view in views.cameras or misfit > MAX_UNDISTORTION:

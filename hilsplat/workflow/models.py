@@ -8,7 +8,7 @@ from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.base.files import INSTALLED
 from hilsplat.baselines import OURS, method_of
 from hilsplat.configuration import CONFIG, StageSettings, parse_run, read_config
-from hilsplat.models.card import network_device
+from hilsplat.models.card import card_problem, require_card
 from hilsplat.models.store import RELEASES, meaningless, read_model
 from hilsplat.scene.sheet import PHOTOS
 
@@ -47,16 +47,16 @@ def check_stages(stages: StageSettings, where: str) -> None:
 
 
 def check_device(stages: StageSettings, where: str) -> None:
-    """Raise an error for `device: cuda` if this machine has no usable CUDA device."""
-    from hilsplat.splat.rasterise.device import cuda_problem, require_cuda
+    """Raise an error for `device: cuda` if this machine cannot be expected to have a usable CUDA device."""
+    from hilsplat.splat.rasterise.device import expected_problem, require_cuda
 
     for section, values in stages:
         if getattr(values, "device", "") == "cuda":
             try:
                 if section in ("masks", "clip"):
-                    network_device("cuda", section, 0.0)
+                    require_card(card_problem(), section)
                 else:
-                    require_cuda(cuda_problem())
+                    require_cuda(expected_problem())
             except HilsplatError as error:
                 raise HilsplatError(f"{section}.device of {where}: {error}") from error
 

@@ -26,6 +26,7 @@ from hilsplat.scene.sheet import (
     sheet_text,
 )
 from hilsplat.workflow.findings import Parts, find_parts
+from hilsplat.workflow.scene_data import SceneData
 
 
 def add_scene(
@@ -63,6 +64,7 @@ def add_scene(
         SceneError: the name is invalid or taken, a path cannot be written to the sheet, the labels differ
             from those of an earlier scene of that name, photographs cannot be read, or there are fewer than
             three distinct photographs and no known poses. The sheet is then left unchanged.
+        SettingsError, ArtifactError: a run would refuse a file for its name, or for its time in the future.
     """
     sheet, photos = Path(sheet), Path(photos)
     photos = (photos if photos.exists() else Path(os.path.expanduser(photos))).resolve()  # noqa: PTH111
@@ -87,14 +89,15 @@ def add_scene(
                 report = inspect_photos(folder, parts.posed)
                 report = replace(report, notes=(*notes, *parts.lines), columns=parts.columns)
                 _check(report, bool(parts.posed), settings.poses.min_registered_share)
+                text = _with_row(sheet, name, folder, parts.columns)
                 if dry_run:
                     return report
                 if copied_labels:
                     with atomic_folder(annotated) as copies:
                         for path, copy in copied_labels.items():
-                            shutil.copy2(path, copies / copy)
+                            shutil.copyfile(path, copies / copy)
                 with undone_on_error(annotated) if copied_labels else nullcontext():
-                    _append(sheet, name, folder, parts.columns)
+                    write_text(sheet, text)
         return report
 
 
@@ -117,7 +120,7 @@ def _labels_to_copy(annotated: Path, parts: Parts) -> dict[Path, str]:
 
 
 def _require_new(sheet: Path, name: str) -> None:
-    for row in read_sheet(sheet, checked_groups=()) if sheet.exists() else []:
+    for row in read_sheet(sheet, ()) if sheet.exists() else []:
         if row.name.casefold() == f"{PHOTOS}/{name}".casefold():
             raise SceneError(
                 f"scene {row.name} is already in {sheet}",
@@ -146,10 +149,13 @@ def _check(report: PhotoReport, have_poses: bool, min_share: float) -> None:
         )
 
 
-def _append(sheet: Path, name: str, photos: Path, columns: dict[str, Path]) -> None:
-    """Append a row whose paths the reader of the sheet resolves to the given ones.
+def _with_row(sheet: Path, name: str, photos: Path, columns: dict[str, Path]) -> str:
+    """Return the sheet's text with a row whose paths the reader of the sheet resolves to the given ones.
 
     The reader strips cells and expands "~", `data:` and generators, unless a path begins with "./".
+
+    Raises:
+        HilsplatError: the sheet cannot hold a path, or a run would refuse a file for its name or time.
     """
     root = project_root(sheet)
     meant = {"folder": photos, **columns}
@@ -174,9 +180,12 @@ def _append(sheet: Path, name: str, photos: Path, columns: dict[str, Path]) -> N
             if "".join(cells.values()).isprintable() and all(
                 getattr(read, column) in (path, path.resolve()) for column, path in meant.items()
             ):
-                return write_text(sheet, text)
-    raise SceneError(
-        f"a path of {name} cannot be written to the scene sheet",
-        found=", ".join(map(repr, cells.values())),
-        fix="rename the folder or file",
-    )
+                break
+    else:
+        raise SceneError(
+            f"a path of {name} cannot be written to the scene sheet",
+            found=", ".join(map(repr, cells.values())),
+            fix="rename the folder or file",
+        )
+    SceneData([read], "", str).require_usable_files(read)
+    return text

@@ -45,6 +45,10 @@ SCORED = "evaluate"  # the stage that reads everything that a variant may change
 Option = Callable[[Any], Any]  # an option of a stage's command: a function of the wildcards
 
 
+UNCOMPARED = frozenset({"device"})
+"""Settings whose change doesn't rerun a stage. Devices have equal results up to rounding, and a change to the
+CPU must not discard what a card has finished."""
+
 LINKING = ("contributions", "coverage_tree", "semantic_tree")
 """Artifacts that relate masks to each other and to Gaussians."""
 
@@ -118,14 +122,13 @@ class Plan:
             )
         require_variant_sections(run)
         sheet = project_path(run.scenes)
-        rows = with_installed(read_sheet(sheet, run.groups, run.data_root), run.only, run.data_root)
+        rows = with_installed(read_sheet(sheet, (), run.data_root), run.only, run.data_root)
         names_of_data = unlisted({row.source for row in rows}, run.groups, run.data_root)
         self.rows = (*rows, *(row_of_data(name, run.data_root) for name in names_of_data))
         self.ignored = without_scene(run, [*self.rows, *read_sheet(INSTALLED / DEFAULT_SHEET, ())])
         self.data = SceneData(self.rows, run.data_root, self.path)
         chosen = choose_scenes(self.rows, run.groups, run.only)
-        if more := {row.group for row in chosen} - set(run.groups):  # check their sources too
-            read_sheet(sheet, {*run.groups, *more}, run.data_root)
+        read_sheet(sheet, {row.name for row in chosen}, run.data_root)  # checks their sources
         reasons = {row.name: self.data.absence(row) for row in chosen}
         self.absent = {name: reason for name, reason in reasons.items() if reason is not None}
         self.scenes = tuple(row for row in chosen if row.name not in self.absent)
@@ -162,7 +165,11 @@ class Plan:
             "names": self.names,
             "queries": self.queries,
         }
-        self._json = functools.cache(lambda section, *which: self._section(section, *which).model_dump_json())
+        self._json = functools.cache(
+            lambda section, omitted, *which: self._section(section, *which).model_dump_json(
+                exclude={*omitted}
+            )
+        )
         self.identity = functools.cache(self._identity)
         self._variants = run.every_variant()
         self._files = [(stage.scope, stage.file) for stage in all_stages().values()]
@@ -172,7 +179,7 @@ class Plan:
         self._unlisted = {f"{path.parent.name}/{path.name}" for path in inside} - names
         self._first_alike = functools.cache(self._first_with_equal_identity)
         for row in self.scenes:
-            self.data.require_no_braces(row)
+            self.data.require_usable_files(row)
 
     def absent_lines(self) -> list[str]:
         """Return a line for each data set with skipped scenes, or for each reason if there are several."""
@@ -211,12 +218,13 @@ class Plan:
     def _section(self, section: str, variant: str, scopes: tuple[str, ...]) -> Any:
         return getattr(self.stages_of(variant, scopes), section)
 
-    def settings(self, section: str, job: Job) -> str:
+    def settings(self, section: str, job: Job, omitted: frozenset[str] = frozenset()) -> str:
         """Return a section's settings for a job, as JSON; only levels apply to imported masks."""
         if section == "masks" and self.row(job).features is not None:
             masks = self.stages(job).masks
-            return MasksSettings(segmenter="graph", levels=masks.levels, theta=masks.theta).model_dump_json()
-        return escape_json_for_report(self._json(section, *self.which(job)))
+            imported = MasksSettings(segmenter="graph", levels=masks.levels, theta=masks.theta)
+            return imported.model_dump_json(exclude={*omitted})
+        return escape_json_for_report(self._json(section, omitted, *self.which(job)))
 
     def seeded(self, variant: str, row: SceneRow, table: str) -> list[str]:
         """Return a variant and, if it is random, its repetitions with a table's other seeds."""
@@ -265,11 +273,12 @@ class Plan:
         stage = stage_of(name)
 
         def settings(wildcards: Any) -> str:
-            return words_of(stage, self._values(stage, wildcards, options))
+            return words_of(stage, self._values(stage, wildcards, options, UNCOMPARED))
 
         def command(wildcards: Any, input: Any, output: Any) -> str:
+            values = words_of(stage, self._values(stage, wildcards, options))
             paths = words_of(stage, self._paths(stage, wildcards, input, output))
-            return f"{stage.command} {settings(wildcards)} {paths}"
+            return f"{stage.command} {values} {paths}"
 
         code = functools.cache(stage.code_digest)
         # Snakemake compares only parameters that don't derive from input and output.
@@ -283,14 +292,23 @@ class Plan:
         models = [name for name in stage.sections.values() if "model" in SECTIONS[name].model_fields]
         return params | ({"model": self.model(models[0])} if models else {})
 
-    def _values(self, stage: Stage[..., Any], job: Any, options: Mapping[str, Option]) -> dict[str, Any]:
-        """Return the values of a stage's parameters that don't depend on its rule's input and output."""
+    def _values(
+        self,
+        stage: Stage[..., Any],
+        job: Any,
+        options: Mapping[str, Option],
+        omitted: frozenset[str] = frozenset(),
+    ) -> dict[str, Any]:
+        """Return the values of a stage's parameters that don't depend on its rule's input and output.
+
+        Settings lack the `omitted` ones.
+        """
         values: dict[str, Any] = {}
         for name in stage.hints:
             if (option := options.get(name, self.options.get(name))) is not None:
                 values[name] = option(job)
             elif name in stage.sections:
-                values[name] = self.settings(stage.sections[name], job)
+                values[name] = self.settings(stage.sections[name], job, omitted)
             elif name == "seed":
                 values[name] = str(self.seed(stage, job))
         return values

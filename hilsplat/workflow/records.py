@@ -16,8 +16,10 @@ from hilsplat.base.artifacts import RUN, provenance_path, run_command
 from hilsplat.base.atomic import was_interrupted
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.lineage import (
+    UNREADABLE,
     Provenance,
     artifacts_in,
+    digests_of,
     files_of,
     read_provenance,
     sha256_of_path,
@@ -28,7 +30,7 @@ from hilsplat.models.store import model_digest
 from hilsplat.stage import Stage
 from hilsplat.stages import all_stages
 from hilsplat.workflow import targets
-from hilsplat.workflow.plan import Plan, words_of
+from hilsplat.workflow.plan import UNCOMPARED, Plan, words_of
 from hilsplat.workflow.scene_data import VariantJob, of_variant
 
 WHOLE, STALE, DAMAGED = "whole", "stale", "damaged"
@@ -80,7 +82,8 @@ def verify(results: Path) -> tuple[str, bool]:
     lines.append(f"{len(artifacts)} artifacts in {results}: {states}")
     is_whole = counts[WHOLE] == len(artifacts)
     if not is_whole:
-        root = next((path for path in results.resolve().parents if (path / RUN).is_file()), results)
+        folder = results.resolve()
+        root = next((path for path in (folder, *folder.parents) if (path / RUN).is_file()), results)
         lines.append(f"to rebuild them, in the project that made them: {run_command(root, '--verify')}")
     return "\n".join(lines), is_whole
 
@@ -145,14 +148,21 @@ class Records:
             if kind != stage.name:
                 yield f"it was made by stage {stage.name}, not {kind}"
             for section in stage.sections.values():
-                now = json.loads(self.plan.settings(section, job))
-                if record.settings.get(section) != now:
-                    yield f"it was made with {section} {record.settings.get(section)!r}, not {now!r}"
+                now = json.loads(self.plan.settings(section, job, UNCOMPARED))
+                made = dict(record.settings.get(section, {}))
+                made = {name: value for name, value in made.items() if name not in UNCOMPARED}
+                if made != now:
+                    yield f"it was made with {section} {made!r}, not {now!r}"
             seed = self.plan.seed(stage, job) if "seed" in stage.hints else None
             if record.seed != seed:
                 yield f"it was made with seed {record.seed}, not {seed}"
             options = {name: self.plan.options[name](job) for name in OPTIONS if name in stage.hints}
             yield from self._other_options(stage, record, options)
+            images, photographs = record.inputs.get("images"), self.plan.data.image_files(job)
+            if images is not None and images.files is not None and isinstance(photographs, list):
+                now = digests_of(photographs, self.plan.data.memo(job))
+                if sorted(now.values()) != sorted(filter(None, images.files.values())):
+                    yield "it was made from other photographs"  # perhaps by another project
         try:
             code = stage.code_digest(record.plugins)
         except HilsplatError:  # this version does not have the reader
@@ -162,6 +172,10 @@ class Records:
         written, paths = self._written_results(artifact, record), set[str]()
         for name, read in record.inputs.items():
             files = {read.path: read.sha256} if read.files is None else read.files
+            outside = [file for file in files if not Path(file).is_relative_to(written)]
+            if self.plan is not None and job is not None and not self.every_byte and name != "model":
+                found = digests_of(outside, self.plan.data.memo(job))
+                self._digests |= {Path(file): found[file] for file in outside if found[file] != UNREADABLE}
             for file, digest in files.items():
                 inside = Path(file).is_relative_to(written)
                 path = self.results / Path(file).relative_to(written) if inside else Path(file)

@@ -30,13 +30,14 @@ from hilsplat.base.memory import MIB
 from hilsplat.baselines import TrainedSettings
 from hilsplat.configuration import SECTIONS, StageSettings
 from hilsplat.datasets.generators import GENERATORS
+from hilsplat.datasets.sources import is_exported
 from hilsplat.models.card import card_problem
 from hilsplat.models.store import RELEASES, model_path, planned_model
 from hilsplat.scene.layouts import vertex_count
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.semantic_tree.limits import MAX_ALL
 from hilsplat.settings import GaussiansSettings, MasksSettings
-from hilsplat.splat.rasterise.device import cuda_problem
+from hilsplat.splat.rasterise.device import expected_problem
 from hilsplat.splat.steps import fit_steps
 from hilsplat.stages import all_stages, family_of, stage_of
 from hilsplat.workflow.plan import SCORED, Plan
@@ -124,7 +125,7 @@ class JobResources:
         many = cores is not None and len(plan.run.variant_names()) >= cores
         self._per_variant = 1 if many else self._per_scene
         self.size = functools.cache(self._size)
-        self.gaussians = functools.cache(self._gaussians)
+        self.gaussians, self.fitted = functools.cache(self._gaussians), functools.cache(self._fitted)
         self.queries = functools.cache(plan.data.num_labelled)
         self._seconds = functools.cache(self._estimate)
 
@@ -182,15 +183,14 @@ class JobResources:
 
         For `device: auto`, these are jobs on this machine if it has a card; nodes of a cluster are unknown.
         """
-        problem = cuda_problem if section in ("gaussians", "contributions") else card_problem
+        problem = expected_problem if section in ("gaussians", "contributions") else card_problem
+        has_card = functools.cache(lambda: self.cores is not None and bool(cards()) and problem() is None)
 
         def needed(wildcards: Any) -> int:
             row, settings = self.plan.row(wildcards), getattr(self.plan.stages(wildcards), section)
-            is_imported = row.gaussians is not None if section == "gaussians" else bool(row.features)
-            if is_imported and section != "contributions":
+            if _is_imported(section, row) or not settings.uses_card:
                 return 0
-            has_card = settings.device == "cuda" or (self.cores is not None and cards() and problem() is None)
-            return int(settings.uses_card and bool(has_card))
+            return int(settings.device == "cuda" or has_card())
 
         return needed
 
@@ -205,18 +205,23 @@ class JobResources:
 
     def core_seconds(self, rule: str, job: Job) -> float:
         """Return the estimated core seconds of a scene's job."""
-        row = self.plan.row(job)
-        seconds = self._seconds(cost_name(rule), *self.plan.which(job), self.size(row))
+        row, rule = self.plan.row(job), cost_name(rule)
+        if _is_imported(rule, row):  # reading a view's files is assumed to take as long as an embedded model
+            return START_S + EMBEDDED_S.get(rule, 0.0) * self.size(row).views
+        seconds = self._seconds(rule, *self.plan.which(job), self.size(row), self.fitted(row))
         if rule == SCORED:
             seconds = max(seconds, QUERY_S_PER_MP * self.queries(row) * self.size(row).view_mp)
         return START_S + seconds
 
     def card_seconds(self, rule: str, job: Job) -> float | None:
         """Return how many seconds a job would take on a card (`GPU`), or None if it has no work for one."""
-        rule, stages, (views, view_mp) = cost_name(rule), self.plan.stages(job), self.size(self.plan.row(job))
+        rule, stages, row = cost_name(rule), self.plan.stages(job), self.plan.row(job)
+        if _is_imported(rule, row):
+            return None
+        views, view_mp = self.size(row)
         if rule == "gaussians":
             steps, seen_mp = _steps_and_mp(stages.gaussians, views, view_mp)
-            per_gaussian = GPU["fit_step_s_per_gaussian"] * MEAN_SHARE * stages.gaussians.max_gaussians
+            per_gaussian = GPU["fit_step_s_per_gaussian"] * MEAN_SHARE * self.fitted(row)
             return START_S + steps * (GPU["fit_step_s"] + GPU["fit_step_s_per_mp"] * seen_mp + per_gaussian)
         if not self._uses_network(rule, stages):
             return None
@@ -228,9 +233,11 @@ class JobResources:
 
     def candidates(self, rule: str, job: Job) -> tuple[Any, ...] | None:
         """Return what the candidates of a job's SAM depend on, or None; jobs of a scene share cached ones."""
-        if cost_name(rule) != "masks" or not self._uses_network("masks", stages := self.plan.stages(job)):
+        stages, row = self.plan.stages(job), self.plan.row(job)
+        rule = cost_name(rule)
+        if rule != "masks" or _is_imported(rule, row) or not self._uses_network(rule, stages):
             return None
-        return self.plan.row(job).name, *(getattr(stages.masks, name) for name in CANDIDATES)
+        return row.name, *(getattr(stages.masks, name) for name in CANDIDATES)
 
     def _uses_network(self, rule: str, stages: StageSettings) -> bool:
         """Return whether a job runs a released SAM or CLIP."""
@@ -239,13 +246,13 @@ class JobResources:
         model = planned_model(Path(getattr(stages, rule).model))
         return model is not None and not model.embedded
 
-    def _estimate(self, rule: str, variant: str, scopes: tuple[str, ...], size: Size) -> float:
+    def _estimate(self, rule: str, variant: str, scopes: tuple[str, ...], size: Size, fitted: int) -> float:
         stages = self.plan.stages_of(variant, scopes)
         views, view_mp = size
         if rule == "gaussians":
             fit = stages.gaussians
             steps, seen_mp = _steps_and_mp(fit, views, view_mp)
-            return steps * (FIT_S_PER_MP * seen_mp + FIT_S_PER_GAUSSIAN * fit.max_gaussians)
+            return steps * (FIT_S_PER_MP * seen_mp + FIT_S_PER_GAUSSIAN * fitted)
         if rule == "masks" and stages.masks.segmenter == "graph":
             return GRAPH_S_PER_MP * views * view_mp
         if rule in EMBEDDED_S:
@@ -274,17 +281,32 @@ class JobResources:
         return Size(self.plan.data.num_images(row), first_mp)
 
     def _gaussians(self, row: SceneRow) -> int:
-        """Return the number of Gaussians in the PLY that replaces the fit, or the limit of the fit."""
+        """Return the number of Gaussians in the PLY that replaces the fit, or of the fit at most."""
         known = vertex_count(row.gaussians) if row.gaussians is not None else None
-        return known or self.plan.stages(row).gaussians.max_gaussians
+        return known or self.fitted(row)
+
+    def _fitted(self, row: SceneRow) -> int:
+        """Return the limit of a fit or, if its Gaussians are frozen at vertices of a mesh, their number."""
+        fit, files = self.plan.stages(row).gaussians, list[str]()
+        if fit.initial == "frozen" and is_exported(row.source):
+            files = self.plan.data.source_files(row)
+        meshes = (Path(file) for file in files if file.endswith(".ply"))
+        return next(filter(None, map(vertex_count, meshes)), fit.max_gaussians)
 
     def _model_mb(self, rule: str, wildcards: Job, threads: int) -> int:
         """Return a model's memory with one view per thread, MB; the stage uses at most the free memory."""
-        settings = getattr(self.plan.stages(wildcards), rule) if rule in EMBEDDED_S else None
-        if settings is None or getattr(settings, "segmenter", "sam") != "sam":
+        if rule not in EMBEDDED_S or _is_imported(rule, self.plan.row(wildcards)):
+            return 0
+        settings = getattr(self.plan.stages(wildcards), rule)
+        if getattr(settings, "segmenter", "sam") != "sam":
             return 0
         batch = settings.batch if rule == "clip" else settings.points_per_batch
         return _model_memory_mb(model_path(settings.model), settings.variant, batch, threads)
+
+
+def _is_imported(rule: str, row: SceneRow) -> bool:
+    """Return whether a user's files replace Gaussians, masks or CLIP vectors that a rule would compute."""
+    return row.gaussians is not None if rule == "gaussians" else rule in EMBEDDED_S and bool(row.features)
 
 
 def _pairs_mb(views: int) -> float:

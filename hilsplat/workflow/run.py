@@ -24,10 +24,17 @@ from typing import Any
 
 import yaml
 
-from hilsplat.base.artifacts import RUN, write_json, write_text
+from hilsplat.base.artifacts import RUN, read_memo, write_json, write_text
 from hilsplat.base.errors import HilsplatError, SettingsError, nearest
 from hilsplat.base.files import INSTALLED, project_path
-from hilsplat.base.processes import end_with_workflow, lock, parent_variable, remove_leftovers
+from hilsplat.base.processes import (
+    boot_id,
+    end_with_workflow,
+    lock,
+    num_cores,
+    parent_variable,
+    remove_leftovers,
+)
 from hilsplat.base.removal import delete
 from hilsplat.configuration import CONFIG, SECTIONS, first_unusable, merged_config, parse_run, read_config
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, is_pattern, matches_of, read_sheet, with_installed
@@ -79,16 +86,21 @@ def mark_run(results: Path) -> None:
     """
     _held.append(_locked_results(results))
     marker = _locked(STATE / f"run-{secrets.token_hex(4)}")
-    marker.write(socket.gethostname())
+    marker.write(f"{socket.gethostname()} {boot_id()}")
     marker.flush()
     _held.append(marker)
 
 
-def record_run(results: Path, configs: Sequence[Path], overrides: Mapping[str, Any]) -> None:
-    """Record a run's configuration in the results, for the commands that messages suggest (`run_command`)."""
+def record_run(plan: Plan, configs: Sequence[Path], overrides: Mapping[str, Any]) -> None:
+    """Record a run's options in its results and scenes, for the commands in messages (`run_command`)."""
     files = [_config_name(Path(path)) for path in configs]
     values = [f"{key}={json.dumps(value)}" for key, value in overrides.items() if key != "only"]
-    write_json(results / RUN, {"results": [str(results)], "config": files, "overrides": values})
+    run = {"results": [str(plan.results)], "config": files, "overrides": values}
+    write_json(plan.results / RUN, run)
+    for row in plan.scenes:
+        record, path = {"scene": [row.name], **run}, Path(plan.path(row), RUN)
+        if read_memo(path, dict[str, list[str]]) != record:  # few of a thousand scenes change
+            write_json(path, record)
 
 
 def _config_name(path: Path) -> str:
@@ -118,7 +130,7 @@ def _locked_results(results: Path) -> TextIOWrapper:
 
 def _locked(path: Path, *, shared: bool = False, wait: bool = True) -> TextIOWrapper:
     path.parent.mkdir(parents=True, exist_ok=True)
-    stream = path.open("a", encoding="utf-8")
+    stream = path.open("a+", encoding="utf-8")  # NFS 4 refuses a shared lock on a file that is not readable
     try:
         lock(stream, shared=shared, wait=wait)
     except OSError:
@@ -199,7 +211,7 @@ def run(
     command += ["--configfile", *map(str, configs)] if configs else []
     command += ["--config", *given.config] if given.config else []
     if given.cores or not _has(others, *ELSEWHERE, "--jobs", "-j"):
-        command += ["--cores", given.cores or str(_all_cores())]
+        command += ["--cores", given.cores or str(num_cores())]
     for folder in (Path.cwd(), Path(".snakemake")):
         if folder.exists() and not os.access(folder, os.W_OK):
             fix = "run in a folder of your own: hilsplat init there, or copy config/ to it"
@@ -210,7 +222,7 @@ def run(
         _recover(command, plan.results)
     if not _has(others, *ELSEWHERE):
         cores = int(given.cores) if given.cores and given.cores.isdecimal() else 0
-        for line in forecasts(plan, cores or _all_cores()):
+        for line in forecasts(plan, cores or num_cores()):
             logger.info("%s", line)
     status = _start(command, plan, targets, scenes, given.forcerun, every_byte)
     if status != 0:
@@ -342,10 +354,6 @@ def _has(words: Sequence[str], *options: str) -> bool:
     )
 
 
-def _all_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _recover(command: Sequence[str], results: Path) -> None:
     """Remove unfinished files left by a killed run and, if no process is alive, Snakemake's locks."""
     markers = sorted(STATE.glob("run-*"))
@@ -359,13 +367,15 @@ def _recover(command: Sequence[str], results: Path) -> None:
                 f"another Snakemake process is running in {Path.cwd()}", fix="let it finish, or stop it"
             ) from error
     remove_leftovers(results)
-    hosts = {marker.read_text(encoding="utf-8") for marker in markers} - {""}  # "": its disk was full
-    if hosts - {socket.gethostname()} and "--unlock" not in command:
+    hosts = [marker.read_text(encoding="utf-8").split() for marker in markers]  # none if its disk was full
+    here = {socket.gethostname(), boot_id()} - {""}
+    if any(host and here.isdisjoint(host) for host in hosts) and "--unlock" not in command:
         logger.warning("another machine may be running this workflow; if not, add once: -- --unlock")
         return
     try:
         alone = _locked(STATE / "processes.lock", wait=False)
     except BlockingIOError:
+        logger.warning("jobs of a killed run are still running: wait for them, or end them (scancel)")
         return
     with alone:
         done = _snakemake(command, "--unlock")

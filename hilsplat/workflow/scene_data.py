@@ -100,7 +100,7 @@ class SceneData:
         return [*map(Path, self.source_files(job))] if is_exported(row.source) else self._photographs(row)
 
     def num_images(self, job: Job) -> int:
-        """Return the number of photographs, as far as files tell."""
+        """Return the number of photographs, estimated if they are inside other files."""
         source, files = self.row(job).source, self.photographs(job)
         names = published(source) if is_exported(source) else None
         return DATASETS[names[0]].num_images(files) if names else len(files)
@@ -113,10 +113,20 @@ class SceneData:
             if isinstance(paths, str):
                 paths = []  # a folder that a rule writes
             _require_past(paths)
-            memo = Path(self.path(job)).parents[1] / ".cache/inputs" / job.dataset / f"{job.scene}.json"
-            return self._digest(memo if paths else None, *paths)
+            return self._digest(self.memo(job) if paths else None, *paths)
 
         return digest
+
+    def memo(self, job: Job) -> Path:
+        """Return the memo of the digests of a scene's files outside the results (`digests_of`)."""
+        return Path(self.path(job)).parents[1] / ".cache/inputs" / job.dataset / f"{job.scene}.json"
+
+    def require_usable_files(self, row: SceneRow) -> None:
+        """Raise HilsplatError for files of a user that would stop a run: by their names or times."""
+        self.require_no_braces(row)
+        photographs = self.image_files(row) if row.folder is not None else []
+        photographs = [] if isinstance(photographs, str) else photographs
+        _require_past([*photographs, *self.gaussians_files(row), *self.features(row), *self.label_files(row)])
 
     def require_no_braces(self, row: SceneRow) -> None:
         """Raise SettingsError for file names with braces, which Snakemake interprets as wildcards."""
@@ -229,7 +239,8 @@ class SceneData:
 def _images_of(row: SceneRow, files: Iterable[str]) -> list[Path]:
     """Return the photographs among the files of a source, without copies in other folders."""
     images = largest_copies([path for path in map(Path, files) if path.suffix.lower() in IMAGE_SUFFIXES])
-    assert row.folder is not None  # as of all sources with photographs
+    if not images or row.folder is None:
+        return images
     folder = Path(portable(photo_folder(row.folder)))
     return [path for path in images if folder in path.parents] or images
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hilsplat.base.artifacts import rebuild_command, run_command
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.errors import HilsplatError, shorten_list
 from hilsplat.base.tables import aligned_table, counted, read_csv
 from hilsplat.evaluate.scenes import scene_lines
 from hilsplat.evaluate.tables.means import TEXTS
@@ -41,6 +41,11 @@ def summary(plan: Plan, files: Sequence[str] = ()) -> list[str]:
     tables = [path for path in targets.tables(plan) if Path(path).is_file()]
     if tables and any(map(targets.data_of, rows)):
         lines.append(f"tables: {Path(tables[0]).parent}/*.md")
+        if not files and (missing := targets.left_out(plan)):
+            lines.append(
+                f"  without scenes that have scores but are not in this run: {shorten_list(missing)}; "
+                "to include them, add their groups to `groups` and run: hilsplat run tables"
+            )
     return lines
 
 

@@ -1,9 +1,13 @@
 """Targets of a run: tables, their scores, and pictures."""
 
+from itertools import chain
+from pathlib import Path
+
 from hilsplat.base.errors import shorten_list
 from hilsplat.datasets.generators import GENERATORS
-from hilsplat.datasets.registry import DATASETS
-from hilsplat.datasets.sources import published
+from hilsplat.datasets.registry import ANNOTATED, DATASETS
+from hilsplat.datasets.sources import LEVELLED, published
+from hilsplat.evaluate.tables.image_tables import averaged_scenes
 from hilsplat.evaluate.tables.kinds import TABLES
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.workflow.plan import Plan
@@ -27,6 +31,8 @@ def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
     rows = [row for row in labelled(plan) if table in tables_of(row)]
     if kind.variants != "main_variants" and plan.run.sweep_scenes:
         rows = [row for row in rows if row.scene in plan.run.sweep_scenes]
+    if kind.has_levels:
+        rows = _of_levels(plan, rows, shows_flat="3D-OVS mIoU" in chain(*kind.columns))
     return [
         plan.path(row, variant, name)
         for row in rows
@@ -35,10 +41,29 @@ def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
     ]
 
 
+def _of_levels(plan: Plan, rows: list[SceneRow], *, shows_flat: bool) -> list[SceneRow]:
+    """Return the scenes whose labels may have levels.
+
+    With `shows_flat`, rows of Hi-LERF also show scores of 3D-OVS, and rows of Hi-3DOVS those of LERF
+    (`flat_scores`), so these scenes are included if labels of the other data set have levels.
+    """
+    levelled = {row: _label_sets(plan, row).intersection((*LEVELLED, ANNOTATED)) for row in rows}
+    benchmarks = {DATASETS[name].images_of for names in levelled.values() for name in names - {ANNOTATED}}
+
+    def is_beside(row: SceneRow) -> bool:
+        return bool(benchmarks - {data_of(row)}) and row.scene in averaged_scenes(data_of(row))
+
+    return [row for row in rows if row.generated or levelled[row] or (shows_flat and is_beside(row))]
+
+
+def _label_sets(plan: Plan, row: SceneRow) -> set[str]:
+    """Return the names of the data sets whose labels a scene has."""
+    return {name.partition("/")[0] for name in plan.data.labels(row)}
+
+
 def absent(plan: Plan, table: str) -> list[str]:
-    """Return a sentence about each of a table's data sets that has unmeasured scenes."""
+    """Return a sentence about each of a table's data sets that has unmeasured scenes or lacks labels."""
     by_dataset: dict[str, list[tuple[str, str]]] = {}
-    sources = {data_of(row) for row in plan.rows}
     for row in plan.rows:
         reason = plan.data.absence(row)
         names = published(row.source)
@@ -46,15 +71,26 @@ def absent(plan: Plan, table: str) -> list[str]:
             by_dataset.setdefault(row.dataset, []).append((row.scene, reason))
     sentences = [
         f"{name}: no labelled segment was found in {plan.run.data_root or 'data_root, which is not set'}."
-        for name in DATASETS
-        if name in plan.run.groups and table in DATASETS[name].tables and name not in sources
+        for name in _not_found(plan)
+        if table in DATASETS[name].tables
     ]
     for dataset, scenes in by_dataset.items():
         reasons = {reason for _, reason in scenes}
         others = "" if len(reasons) == 1 else " The other scenes cannot be read either."
         listed = shorten_list([scene for scene, _ in scenes])
         sentences.append(f"{dataset} ({listed}): {scenes[0][1]}.{others}")
+    for data in (DATASETS[name] for name in LEVELLED if TABLES[table].has_levels):
+        rows = [row for row in plan.scenes if data_of(row) == data.images_of and table in tables_of(row)]
+        if unlabelled := [row.scene for row in rows if data.name not in _label_sets(plan, row)]:
+            listed, place = shorten_list(unlabelled), data.root(plan.run.data_root)
+            sentences.append(f"{data.name} ({listed}): {place} has no labels with levels.")
     return sentences
+
+
+def _not_found(plan: Plan) -> list[str]:
+    """Return the data sets among the groups that have neither rows in the sheet nor scenes on the disk."""
+    sources = {data_of(row) for row in plan.rows}
+    return [name for name in DATASETS if name in plan.run.groups and name not in sources]
 
 
 def labelled(plan: Plan) -> list[SceneRow]:
@@ -87,22 +123,38 @@ def tables(plan: Plan) -> list[str]:
     ]
 
 
-def default(plan: Plan) -> list[str]:
-    """Return all pictures, vectors of key views, mean scores, tables and plots.
+def of_run(plan: Plan) -> list[str]:
+    """Return the names of the tables with scores of this run, with data that it lacks, or not yet made.
 
-    Tables and plots need a benchmark scene in the run. A run of photographs would otherwise replace a
-    benchmark's tables with tables of reported rows only.
+    The others would lose the measured rows of earlier runs, as would all tables in a run of photographs.
     """
-    plots = [
-        f"{plan.run.results}/figures/sweep-{name}.png"
-        for name in ("theta", "omega")
-        if getattr(plan.run, TABLES[name].variants)
+    if not any(data_of(row) for row in labelled(plan)):
+        return []
+    lacking = {table for row in plan.rows if row.name in plan.absent for table in tables_of(row)}
+    if not plan.run.only:
+        lacking.update(*(DATASETS[name].tables for name in _not_found(plan)))
+    paths = {Path(path).stem: Path(path) for path in tables(plan)}
+    return [
+        name for name, path in paths.items() if name in lacking or scores(plan, name) or not path.exists()
     ]
+
+
+def left_out(plan: Plan) -> list[str]:
+    """Return the scenes with scores of earlier runs that the tables of this run would show but leave out."""
+    shown, names = {*of_run(plan)}, {row.name for row in plan.scenes}
+    others = [row for row in plan.rows if row.name not in names and shown.intersection(tables_of(row))]
+    return [row.name for row in others if any(Path(plan.path(row)).glob("*/scores.csv"))]
+
+
+def default(plan: Plan) -> list[str]:
+    """Return all pictures, vectors of key views, mean scores, and the tables and plots of this run."""
+    shown = of_run(plan)
+    plots = [f"{plan.run.results}/figures/sweep-{name}.png" for name in ("theta", "omega") if name in shown]
     early = [row for row in plan.scenes if plan.first_answer(of_variant(row, "default"))]
     answers = [plan.of_key_views("clip")(row) for row in early]
     means = [plan.path(row, "scores.md") for row in labelled(plan)]
-    has_tables = any(data_of(row) for row in labelled(plan))
-    return [*figures(plan), *answers, *means, *(tables(plan) + plots if has_tables else [])]
+    of_tables = [path for path in tables(plan) if Path(path).stem in shown]
+    return [*figures(plan), *answers, *means, *of_tables, *plots]
 
 
 def compared_means(plan: Plan, job: Job) -> list[str]:

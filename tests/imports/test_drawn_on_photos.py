@@ -5,16 +5,20 @@ its ray does. Rays are computed here, without COLMAP.
 """
 
 import functools
+import io
 import json
 import logging
+import zipfile
+from dataclasses import replace
+from typing import get_args
 
 import cv2
 import numpy as np
 import pytest
 from pycocotools import mask as coco_masks
 
-from hilsplat.annotate.exchange import imported
-from hilsplat.annotate.labels import known_labels
+from hilsplat.annotate.exchange import Kind, exported, imported
+from hilsplat.annotate.labels import Label, known_labels, write_labels
 from hilsplat.base.errors import MisalignedArtifactError, SceneError
 from hilsplat.datasets.images.hi import open_annotated
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene
@@ -22,6 +26,7 @@ from hilsplat.embed.langsplat_files import read_view
 from hilsplat.evaluate.protocols.view_truth import truths_of
 from hilsplat.scene.cameras import Camera, Cameras, Photo
 from hilsplat.scene.scene import Scene
+from hilsplat.web.file_changes import NO_FILE
 
 VIEW = "000.png"
 SIZE = HEIGHT, WIDTH = 150, 200
@@ -99,6 +104,8 @@ SCALES = pytest.mark.parametrize("scale", [1, 0.5, 4])
 LEAST = 0.97
 """A border of half a pixel around the disc is 3 % of its area, or 6 % on a drawing of half the size."""
 
+MOVED = 0.94  # a row more moves pixels by up to one; the map from the photograph would leave 0.74
+
 
 def least(scale: float) -> float:
     return LEAST if scale >= 1 else 0.94
@@ -138,6 +145,36 @@ def test_the_annotator_opens_labels_of_the_photograph(kind, scale, tmp_path):
     write_isat(tmp_path, VIEW, drawn(kind, scale), id=1, level=1, parent=None)
     ((label,),) = known_labels(tmp_path, cameras_of(kind), [VIEW]).values()
     assert iou(label.mask(SIZE)) > least(scale) and label.text == "ball"
+
+
+@pytest.fixture
+def drawn_before() -> tuple[dict[str, list[Label]], Cameras, Cameras]:
+    """A label of the view, the cameras with which it was drawn, and those of a slightly different lens.
+
+    The view is one pixel higher then, so the label's size has the shape of the photograph.
+    """
+    cameras = cameras_of("distorted")
+    label = Label(id=1, level=1, text="ball", polygons=[outline(SEEN)])
+    return {VIEW: [label]}, cameras, replace(cameras, size_hw=np.int32([(HEIGHT + 1, WIDTH)]))
+
+
+def test_annotations_stay_in_place_if_the_lens_is_estimated_again(drawn_before, tmp_path):
+    known, _, cameras = drawn_before
+    write_labels(tmp_path / "photos/desk/000.json", VIEW, SIZE, known[VIEW], NO_FILE)
+    ((label,),) = known_labels(tmp_path / "photos/desk", cameras, [VIEW]).values()
+    assert iou(label.mask(SIZE)) > MOVED
+    labels = open_annotated(tmp_path, "photos/desk")
+    (query,) = truths_of(labels, scene_of(cameras, tmp_path), 0)[VIEW]().categories
+    assert iou(query.truth[:HEIGHT]) > MOVED
+
+
+@pytest.mark.parametrize("kind", get_args(Kind))
+def test_exported_annotations_stay_in_place_if_the_lens_is_estimated_again(kind, drawn_before):
+    known, before, cameras = drawn_before
+    data = exported(kind, known, before)
+    text = data if kind == "coco" else zipfile.ZipFile(io.BytesIO(data)).read("000.json")
+    ((label,),) = imported("000.json", text.decode(), cameras).values()
+    assert iou(label.mask(SIZE)) > MOVED
 
 
 @KINDS

@@ -20,7 +20,7 @@ def write_again(artifact: Path) -> None:
     """Replace an artifact by an equal one, as a rerun stage does."""
     if artifact.is_dir():
         with atomic_folder(artifact) as new:
-            shutil.copytree(artifact, new, dirs_exist_ok=True)
+            shutil.copytree(artifact, new, dirs_exist_ok=True, copy_function=shutil.copyfile)
     else:
         shutil.copy(artifact, artifact.with_name("new"))
         artifact.with_name("new").replace(artifact)

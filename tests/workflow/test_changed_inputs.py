@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -99,5 +100,9 @@ def test_contents_decide_whether_photographs_and_poses_changed(project: Path, tm
     os.utime(photo)
     moved = Project(place.root.rename(tmp_path / "moved"), project)
     assert is_done(moved), "the same files with new times, in another place"
-    (moved.root / "desk/images/0.png").unlink()
+    (photo := moved.root / "desk/images/0.png").unlink()
     assert not is_done(moved), "a photograph less"
+    shutil.rmtree(moved.root / ".snakemake")
+    photo.write_bytes((moved.root / "desk/images/1.png").read_bytes())
+    os.utime(photo, (0, 0))
+    assert not is_done(moved), "an older photograph, without Snakemake's records"

@@ -1,4 +1,4 @@
-"""The groups of the Slurm profile: Snakemake refuses a group that another job stands between."""
+"""Groups of the Slurm profile; Snakemake refuses them if a job outside reads one and is read by another."""
 
 import pytest
 import yaml

@@ -3,6 +3,7 @@
 import { ask, exportUrl, scene as described, tellUnsaved, watch } from "./api.js";
 import { $, attachMenu, counted, LEVELS, make } from "./elements.js";
 import { attachHands } from "./hands.js";
+import { historyOf, isCommand, keyOf } from "./keys.js";
 import { Sheet } from "./sheet.js";
 import { Store } from "./store.js";
 import { attachThings, fillForm, level, LEVEL, makeStrip, markStrip, setLevel, showTexts, showThings, under } from "./things.js";
@@ -80,10 +81,10 @@ function stand(to) {
   sheet.show(number, size_hw);
   $("radius").max = Math.min(MOST_RADIUS, Math.max(60, Math.max(...size_hw) / 20));
   $("picture").alt = scene.views[number].name;
-  history.replaceState(null, "", `${location.pathname}#view=${number}`);
   refresh();
   $("views").children[number].scrollIntoView({ block: "nearest", inline: "nearest" });
   tell(`${scene.views[number].name}${scene.views[number].split === "test" ? ", held out" : ""}`);
+  try { history.replaceState(null, "", `${location.pathname}#view=${number}`); } catch { /* Safari allows 100 calls in 30 s */ }
 }
 
 function setTool(name) {
@@ -365,11 +366,11 @@ document.addEventListener("keydown", (event) => {
   if (document.querySelector("dialog[open]")) return;
   if (event.key === "Escape") { escape(); $("view").focus(); return; }
   const typing = event.target.closest("input:not([type=radio]):not([type=range]), select");
-  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  const key = keyOf(event), way = historyOf(event);
   const isTyped = typing?.id === "text" && typing.value !== (own() ?? aim.next).text;   // the browser undoes typing
-  if ((event.ctrlKey || event.metaKey) && (key === "z" || key === "y") && !isTyped) { step(key === "y" || event.shiftKey ? "redo" : "undo"); event.preventDefault(); return; }
+  if (way && !isTyped) { step(way); event.preventDefault(); return; }
   if (typing) { if (event.key === "Enter" && event.target.id === "text") { event.target.blur(); $("view").focus(); event.preventDefault(); } return; }
-  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  if (isCommand(event)) return;
   const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[key], onView = event.target === $("view") || event.target === document.body;
   const by = event.shiftKey ? 10 : 1;
   const keys = {

@@ -72,7 +72,8 @@ def annotated_regions(path: Path, warnings: list[str]) -> tuple[LabelledRegion, 
     labels = read_isat(path)
     warnings += labels.warnings
     has_levels = any("level" in thing.keys for thing in labels.objects)
-    return regions_of(labels, warnings) if has_levels else merged_regions(labels)
+    regions = regions_of(labels, warnings) if has_levels else merged_regions(labels)
+    return tuple(replace(region, on_view=labels.on_view) for region in regions)
 
 
 def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:

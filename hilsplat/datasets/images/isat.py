@@ -21,6 +21,7 @@ from hilsplat.base.images import image_size_hw
 from hilsplat.base.levels import composed
 from hilsplat.datasets.labelled import check_label_size
 from hilsplat.scene.layouts import read_json_object
+from hilsplat.scene.placement import is_on_view
 
 Polygon = Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"] | Sequence[tuple[int, int]]
 
@@ -82,12 +83,16 @@ class IsatObject:
 
 @dataclass(frozen=True, eq=False)
 class IsatFile:
-    """The objects of one image, in the order of the file, and a warning for each irregularity."""
+    """The objects of one image, in the order of the file, and a warning for each irregularity.
+
+    `on_view` means that the file states that they were drawn on the view, not on its photograph.
+    """
 
     path: Path
     size_hw: tuple[int, int]
     objects: tuple[IsatObject, ...]
     warnings: tuple[str, ...] = ()
+    on_view: bool = False
 
 
 def read_isat(path: Path, image: Path | None = None) -> IsatFile:
@@ -117,7 +122,7 @@ def read_isat(path: Path, image: Path | None = None) -> IsatFile:
     objects = tuple(cut_background(item, things, size_hw) for item in things if item.category != BACKGROUND)
     if image is not None:
         warnings += check_label_size(f"label file {path}", size_hw, image_size_hw(image))
-    return IsatFile(path, size_hw, objects, tuple(warnings))
+    return IsatFile(path, size_hw, objects, tuple(warnings), is_on_view(content["info"]))
 
 
 def stated_size(where: str, content: Any) -> tuple[int, int]:

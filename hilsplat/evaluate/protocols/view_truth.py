@@ -20,7 +20,7 @@ from hilsplat.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
 
-EIGHTH = 8  # 3D-OVS compares masks at one eighth of the image's height and width
+EIGHTH = 8  # 3D-OVS compares masks at one eighth of the height and width of the data set's image
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Query:
     paths: tuple[tuple[str, ...], ...]  # distinct chains of texts that lead to the annotated nodes
     truth: Bool[np.ndarray, "H W"]
     boxes_xyxy: Int[np.ndarray, "B 4"]  # of each annotated node, borders included
-    eighth: Bool[np.ndarray, "h w"]  # at one eighth of the image's size, resized from the label
+    eighth: Bool[np.ndarray, "h w"]  # at one eighth of the data set's image, resized from the label
     any_grey: Bool[np.ndarray, "H W"]  # region for protocols with the ground truth `any grey`
 
     def region(self, truth: str) -> Bool[np.ndarray, "H W"]:
@@ -93,7 +93,9 @@ class ViewTruth:
 
         Args:
             size_hw: size of the predictions; labels of a different size are resized by nearest neighbour.
-            image_hw: size of the image, if it differs from `size_hw`.
+            image_hw: size of the data set's image, if it differs from `size_hw`, as after
+                `poses.max_side_px`. It determines `Query.eighth`, so scores don't depend on the predictions'
+                size.
             min_px: texts and paths with fewer pixels in the view are omitted.
         """
         height, width = image_hw or size_hw
@@ -201,5 +203,5 @@ def truths_of(
     for view in known.check_posed(posed.cameras.names):
         camera, where = posed.cameras[view], f"a label of view {view}"
         regions = [region.on(camera, where) for region in known.views[view]]
-        truths[view] = partial(ViewTruth.of_regions, regions, camera.size_hw)
+        truths[view] = partial(ViewTruth.of_regions, regions, camera.size_hw, known.image_hw(view))
     return truths

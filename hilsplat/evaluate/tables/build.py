@@ -43,6 +43,13 @@ BLOCKS: dict[str, Callable[[TableKind, Sources], list[Block]]] = {
 """Table (without `-seconds`) -> function that returns its measured rows."""
 
 
+TIMES = {
+    "unrecorded": "{}, whose benchmark files are missing; --forcerun runs the stages again.",
+    "partial": "the time of views that these jobs read from the cache, as after an interruption: {}.",
+}
+"""Attribute of a cost that lists stages -> the note below tables of times, with the names of their jobs."""
+
+
 def published_values(table: str) -> Path:
     """Return the file with the paper's values for a table; a `-seconds` table uses the main table's file."""
     return project_path(f"config/published/{table.removesuffix(SECONDS)}.csv")
@@ -90,9 +97,12 @@ def table_of(name: str, sources: Sources, absent: Sequence[str]) -> Table:
         measured = [block for block in map(without_costs, measured) if block.columns]
     blocks = tuple(block for block in (*reported, *measured) if block.rows)
     costs = sources.costs if name.endswith(SECONDS) else ()
-    jobs = {f"{stage} of {cost.dataset}/{cost.scene}": None for cost in costs for stage in cost.unrecorded}
-    times = f"{shorten_list([*jobs])}, whose benchmark files are missing; --forcerun runs the stages again."
-    not_measured = [f"Not measured: {sentence}" for sentence in (*absent, *([times] if jobs else []))]
+    sentences = [*absent]
+    for kind_of_job, sentence in TIMES.items():
+        names = [(cost, stage) for cost in costs for stage in getattr(cost, kind_of_job)]
+        jobs = dict.fromkeys(f"{stage} of {cost.dataset}/{cost.scene}" for cost, stage in names)
+        sentences += [sentence.format(shorten_list([*jobs]))] if jobs else []
+    not_measured = [f"Not measured: {sentence}" for sentence in sentences]
     return Table(name, kind.title, blocks, (*_warnings(blocks), *kind.footnotes, *not_measured))
 
 

@@ -8,6 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hilsplat.base.tables import counted
+from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.metrics.hierarchy import READINGS
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, VIEW_CONSISTENCY
@@ -28,10 +29,16 @@ def lerf_cells(_: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
 def ovs_cells(_: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
     """Return mIoU per scene, and mIoU and accuracy over the scenes of the paper."""
     cells = measured.scene_cells(part, {"mIoU": "iou"})
-    if (part["dataset"] == "3d_ovs").all():
-        part = part[part["scene"].isin(TABLES["3dovs"].averaged)]
+    if averaged := averaged_scenes(part.iloc[0]["dataset"]):
+        part = part[part["scene"].isin(averaged)]
     overall = {"Overall mIoU": "iou", "Overall accuracy": "pixel_accuracy"}
     return cells | {name: measured.percent(part, metric) for name, metric in overall.items()}
+
+
+def averaged_scenes(data: str) -> set[str]:
+    """Return the scenes of a data set that averages without levels cover; empty for all that are scored."""
+    listed = DATASETS[data].scenes if data in DATASETS else ()
+    return {*(TABLES["3dovs"].averaged if data == "3d_ovs" else listed)}
 
 
 def hierarchy_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
@@ -59,14 +66,9 @@ def ablation_blocks(kind: TableKind, sources: Sources) -> list[Block]:
 
 
 def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
-    """Return the values of one row from its scores under all protocols.
-
-    Hi-LERF and Hi-3DOVS label images of LERF and 3D-OVS; the other columns use the labels of LERF and 3D-OVS.
-    """
-    dataset = part.iloc[0]["dataset"]
-    lerf, ovs3d = ("lerf_ovs", "3d_ovs") if dataset in LEVELLED else (dataset, dataset)
-    flat = measured.same_row(scores, part, ("lerf/langsplat@", "lerf/tree-nodes@"), lerf)
-    ovs = measured.same_row(scores, part, ("3d-ovs/langsplat@",), ovs3d)
+    """Return the values of one row under all protocols; `flat_scores` selects those without levels."""
+    flat = flat_scores(scores, part, ("lerf/langsplat@", "lerf/tree-nodes@"), "lerf_ovs")
+    ovs = flat_scores(scores, part, ("3d-ovs/langsplat@",), "3d_ovs")
     levels = measured.level_cells(part)
     average = levels.pop("Avg")
     return {
@@ -78,6 +80,25 @@ def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, C
         "Hi-LERF HC": measured.percent(part, "hc_containment"),
         "Avg, best threshold": measured.level_cells(part, "best_threshold_iou")["Avg"],
     }
+
+
+def flat_scores(
+    scores: "pd.DataFrame", part: "pd.DataFrame", protocols: tuple[str, ...], benchmark: str
+) -> "pd.DataFrame":
+    """Return a row's scores without levels, or none if a scene that they should cover has none.
+
+    Hi-LERF and Hi-3DOVS label images of LERF and 3D-OVS; their rows show scores on the labels of `benchmark`.
+    These cover its averaged scenes; if they are of the row's images, only those that the row covers. Rows
+    of other data show scores on their own labels.
+    """
+    own, covered = part.iloc[0]["dataset"], set(part["scene"])
+    data = benchmark if own in LEVELLED else own
+    if data != own:
+        averaged = averaged_scenes(data)
+        covered = averaged & covered if DATASETS[own].images_of == data else averaged
+    flat = measured.same_row(scores, part, protocols, data)
+    flat = flat[flat["scene"].isin(covered)]
+    return flat if set(flat["scene"]) == covered else flat[:0]
 
 
 def step_cells(

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,8 @@ class TableKind:
         averaged: scenes of a benchmark that averages cover; empty for all.
         columns: value columns. A group whose columns name `{scene}` is repeated for each scene.
         steps: variant -> the variant that its row extends, in ablations; others extend `default`.
-        ranked_by_protocol: whether only rows of the same protocol are ranked together.
+        ranked_together: protocols, without versions, whose rows are ranked with each other. Other rows are
+            ranked only with rows of the same protocol.
     """
 
     title: str
@@ -48,8 +50,19 @@ class TableKind:
     columns: tuple[tuple[str, ...], ...] = ()
     unranked: tuple[str, ...] = ()
     steps: Mapping[str, str] = field(default_factory=dict)
-    ranked_by_protocol: bool = True
+    ranked_together: tuple[str, ...] = ()
     footnotes: tuple[str, ...]
+
+    @property
+    def has_levels(self) -> bool:
+        """Whether its measured rows need labels with levels."""
+        prefixes = [*chain(*self.protocols)]
+        return bool(prefixes) and all(prefix.startswith("hierarchy/") for prefix in prefixes)
+
+    def ranked_with(self, protocol: str) -> str:
+        """Return the ranking group of rows with a protocol's full name; non-default settings are compared."""
+        card, space, settings = protocol.partition(" ")
+        return space + settings if card.partition("@")[0] in self.ranked_together else protocol
 
     def columns_of(self, scenes: Iterable[str]) -> tuple[str, ...]:
         names = sorted(set(scenes))

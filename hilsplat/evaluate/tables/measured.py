@@ -72,7 +72,7 @@ def measured_blocks(
                     names["Seeds"] = str(len(seeds))
                 cells = mean_over_seeds(seeds) | over_seeds(scores, part)
                 is_ranked = method != "truth" and not made_from_truth(masks)
-                group = (label if kind.ranked_by_protocol else "") if is_ranked else None
+                group = kind.ranked_with(label) if is_ranked else None
                 order = row_place(variant, method, sources.labels)
                 sort_key = made_from_truth(masks), _protocol_place(label), *order, masks, label
                 scenes = part["scene"], selected["scene"], kind.averaged

@@ -4,25 +4,24 @@ import contextlib
 import io
 import logging
 import os
+import shutil
 import socket
-import warnings
 from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Literal
 
-from hilsplat.base.cache import forget, remembered
-from hilsplat.base.cards import has_driver, release_card
+from hilsplat.base.cache import forget, recalled, remembered
+from hilsplat.base.cards import cards, has_driver, release_card, take_card
 from hilsplat.base.errors import DeviceError, first_line
+from hilsplat.base.lineage import RASTERISER, version_of
 from hilsplat.base.memory import MIB
-from hilsplat.models.card import free_mib, is_out_of_memory
+from hilsplat.models.card import card_problem, free_mib, is_out_of_memory
 
 logger = logging.getLogger(__name__)
 
 UNBUILT = "the CUDA kernels of gsplat cannot be compiled"
-ABSENT = ("gsplat is not installed", "no NVIDIA driver is installed", "torch ")
-"""Beginnings of the problems of machines on which CUDA is not expected to work."""
-
 TOO_MUCH = "needs more memory than the card has free"
 
 KIND = "cuda"  # kind of `remembered` results about CUDA
@@ -32,31 +31,53 @@ Requested = Literal["auto", "cpu", "cuda"]
 CHOSEN: dict[Requested, Device] = {}  # device of each setting in this process
 
 
-@cache
-def cuda_problem() -> str | None:
-    """Return why the CUDA backend cannot be used here, or None if it can; never raise an exception."""
-    # checked before importing torch, which takes 1.3 to 3 s
-    if find_spec("gsplat") is None:
+def missing_part() -> str | None:
+    """Return what the CUDA backend lacks here as far as files show, or None; torch is not imported."""
+    gsplat = find_spec("gsplat")
+    if gsplat is None:
         return "gsplat is not installed"
     if not has_driver():
         return "no NVIDIA driver is installed"
-    try:
-        import gsplat
-        import torch
+    places = gsplat.submodule_search_locations or ()
+    has_kernels = any(library for place in places for library in Path(place).glob("*.so"))
+    if not has_kernels and not _compiler():
+        return f"{UNBUILT}, because no CUDA toolkit (nvcc) is installed"
+    return None
 
-        with warnings.catch_warnings(record=True, action="always") as caught:
-            is_available = torch.cuda.is_available()
-        if not is_available and caught:  # such as of an old driver
-            return f"CUDA cannot be used: {first_line(caught[-1].message)}"
-        if not is_available:
-            return f"torch {torch.__version__} finds no CUDA device"
+
+def _compiler() -> str | None:
+    """Return the path of nvcc where torch and gsplat look for it."""
+    home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH") or "/usr/local/cuda"
+    return shutil.which("nvcc", path=f"{home}/bin") or shutil.which("nvcc")
+
+
+def expected_problem() -> str | None:
+    """Return why the CUDA backend is not expected to work here, or None.
+
+    This is for planning: nothing is compiled or run on a card. An earlier result of `cuda_problem` counts.
+    """
+    return missing_part() or card_problem() or recalled(KIND, _build()) or None
+
+
+@cache
+def cuda_problem() -> str | None:
+    """Return why the CUDA backend cannot be used here, or None if it can; never raise an exception."""
+    if problem := missing_part() or card_problem():
+        return problem
+    try:
         # a compilation that fails takes minutes, and each stage runs in its own process
-        versions = [torch.__version__, str(torch.version.cuda), gsplat.__version__]
-        known = [os.environ.get(name, "") for name in ("PATH", "CUDA_HOME", "CUDA_VISIBLE_DEVICES")]
-        return remembered(KIND, ["build", *versions, *known, socket.gethostname()], _build_failure) or None
-    except Exception as error:  # a broken installation can raise anything
-        # a card may only be busy or full (`kernel_problem`)
-        return None if _is_of_card(error) else f"gsplat cannot be imported: {first_line(error)}"
+        return remembered(KIND, _build(), _build_failure) or None
+    except Exception:  # the card may only be busy or full (`kernel_problem`)
+        return None
+
+
+def _build() -> list[str]:
+    """Return what decides whether gsplat's kernels can be compiled; equal in plans, jobs and `doctor`."""
+    import torch
+
+    versions = torch.__version__, str(torch.version.cuda), str(version_of("gsplat"))
+    capability = "{}.{}".format(*torch.cuda.get_device_capability())
+    return ["build", *versions, str(_compiler()), capability, socket.gethostname()]
 
 
 def _build_failure() -> str:
@@ -71,8 +92,6 @@ def _build_failure() -> str:
     except Exception as error:  # compilers, linkers and torch raise several types
         if _is_of_card(error):
             raise
-        if isinstance(error, AttributeError):  # without a compiler, gsplat has None instead of its kernels
-            return f"{UNBUILT}, because no CUDA toolkit (nvcc) is installed"
         return f"{UNBUILT}: {first_line(error)}"
     return ""
 
@@ -104,6 +123,7 @@ def kernel_problem() -> str | None:
 def forget_cuda() -> None:
     """Forget earlier results, so that `cuda_problem` and the self-test examine this machine again."""
     forget(KIND)
+    card_problem.cache_clear()
     cuda_problem.cache_clear()
     CHOSEN.clear()
 
@@ -112,14 +132,18 @@ def choose_device(requested: Requested) -> Device:
     """Return the device that a setting selects in this process, and log it the first time.
 
     `auto` uses CUDA if torch finds a device, gsplat works, and a self-test agrees with the CPU. If gsplat is
-    installed but does not work on a machine with a device, a warning names the reason.
-    For `cpu`, or if gsplat or a driver is missing, torch is not imported, which would take 1.3 to 3 s.
+    installed but does not work on a machine with a card, a warning names the reason.
+    For `cpu`, or if gsplat, a driver or a compiler is missing, torch is not imported, which would take 1.3 to
+    3 s. Otherwise, if another job has the card, this function waits for it (`take_card`).
 
     Raises:
         DeviceError: if `cuda` was requested and cannot be used. There is no fallback.
     """
     if requested not in CHOSEN:
         CHOSEN[requested] = _examined(requested)
+    if CHOSEN[requested] == "cuda":
+        take_card()  # `require_card_memory` may have released it
+    RASTERISER.set(CHOSEN[requested])
     return CHOSEN[requested]
 
 
@@ -136,25 +160,32 @@ def require_cuda(problem: str | None) -> None:
 
 
 def _examined(requested: Requested) -> Device:
-    problem = None if requested == "cpu" else cuda_problem() or kernel_problem()
+    problem = None if requested == "cpu" else missing_part()
+    if requested != "cpu" and not problem:
+        take_card()  # before CUDA starts
+        problem = cuda_problem() or kernel_problem()
+        if requested == "auto" and not problem:
+            problem = _self_test_problem()
+        if problem:
+            release_card()
     if requested == "cuda":
         require_cuda(problem)
-    if requested == "auto" and problem is None:
-        from hilsplat.splat.rasterise.parity import cuda_disagreement  # lazy: loads the CPU's kernels
-
-        try:
-            problem = cuda_disagreement()
-        except Exception as error:  # drivers, torch and gsplat raise several types
-            problem = f"the self-test on CUDA failed: {first_line(error)}"
-    device: Device = "cuda" if requested != "cpu" and not problem else "cpu"
-    is_broken = problem is not None and not problem.startswith(ABSENT)
+    device: Device = "cpu" if requested == "cpu" or problem else "cuda"
+    is_broken = bool(problem and find_spec("gsplat") and cards())
     level = logging.WARNING if is_broken else logging.INFO
     advice = "; after a fix, run `hilsplat doctor`" if is_broken else ""
     suffix = f"; {problem}{advice}" if problem else ""
     logger.log(level, "rasterising on %s (device: %s%s)", device, requested, suffix)
-    if device == "cpu":
-        release_card()
     return device
+
+
+def _self_test_problem() -> str | None:
+    from hilsplat.splat.rasterise.parity import cuda_disagreement  # lazy: loads the CPU's kernels
+
+    try:
+        return cuda_disagreement()
+    except Exception as error:  # drivers, torch and gsplat raise several types
+        return f"the self-test on CUDA failed: {first_line(error)}"
 
 
 def require_card_memory(requested: Requested, needed: int, user: str, fix: str) -> Device:
@@ -175,8 +206,8 @@ def require_card_memory(requested: Requested, needed: int, user: str, fix: str) 
             f"{user} {TOO_MUCH}", expected=f"about {_gib(needed)} free", found=f"{_gib(free)} free", fix=fix
         )
     logger.warning("rasterising on cpu (device: auto; %s); to use the card, %s", problem, fix)
-    CHOSEN[requested] = "cpu"  # also for the provenance record
     release_card()
+    RASTERISER.set("cpu")
     return "cpu"
 
 

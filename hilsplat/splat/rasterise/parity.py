@@ -6,6 +6,7 @@ from scipy.sparse import csr_matrix
 from hilsplat.base.cache import remembered
 from hilsplat.base.cards import driver_version
 from hilsplat.base.code import code_digest
+from hilsplat.base.lineage import version_of
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise import api
@@ -17,10 +18,10 @@ MAX_DIFFERENCES = {"loss": 1e-4, "gradients": 1e-2, "step": 2e-2, "weights": 1e-
 
 def cuda_disagreement() -> str | None:
     """Return how CUDA differs from the CPU here, or None; cached per device, versions, driver and code."""
-    import gsplat
     import torch
 
-    versions = [torch.__version__, gsplat.__version__, str(torch.version.cuda), driver_version()]
+    libraries = [version_of(name) for name in ("torch", "gsplat", "fused-ssim")]
+    versions = [*libraries, str(torch.version.cuda), driver_version()]
     code = code_digest("hilsplat.splat.torch_model", disagreement)
     key = ["self-test", *versions, torch.cuda.get_device_name(), code]
     return remembered(KIND, key, lambda: disagreement("cpu", "cuda") or "") or None

@@ -131,5 +131,5 @@ function remember() {
 function keptSearch() {
   if (options.has("embedded")) return location.search;
   const kept = new URLSearchParams([...options].filter(([key, value]) => ["scene", "painter"].includes(key) && value));
-  return kept.size ? `?${kept}` : "";
+  return `${kept}` && `?${kept}`;
 }

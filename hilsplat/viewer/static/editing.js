@@ -171,7 +171,7 @@ const ACTIONS = {
   "edit-crop": () => change((mark) => mark === SELECTED ? 0 : REMOVED), "edit-restore": () => change((mark) => mark === REMOVED ? 0 : mark), "edit-undo": undo, "edit-redo": redo,
   "edit-save": () => { $("save").open = true; $("save").querySelector("[data-save=scene-ply]").focus(); },
 };
-const KEYS = { b: () => setTool("box"), c: () => setTool("brush"), h: () => setTool("move"), i: invert, delete: remove, backspace: remove };
+const KEYS = { b: () => setTool("box"), c: () => setTool("brush"), h: () => setTool("move"), i: invert, Delete: remove, Backspace: remove };
 
 // Act on a key of the edit bar; false if it has no meaning.
 export function pressed(key) {

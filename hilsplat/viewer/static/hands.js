@@ -60,8 +60,7 @@ export function attachHands() {
   attachKeys({
     ask: () => { $("text").focus(); $("text").select(); },
     clear: () => { if (!leaveTool()) clear(); }, step: (by) => { if (!resizeBrush(by)) step(by); }, edit: () => { if (!api.offline) edit(); }, edited: pressed,
-    undone: ({ key, shiftKey }) => { const letter = key.toLowerCase(); if (letter === "z" || letter === "y") (shiftKey || letter === "y" ? redo : undo)(); return letter === "z" || letter === "y"; },
-    home: () => stand(page.camera.first), help: () => $("help").showModal(),
+    undo, redo, home: () => stand(page.camera.first), help: () => $("help").showModal(),
     zoom: (factor) => nudge(() => page.camera.zoom(factor)), orbit: (x, y) => nudge(() => page.camera.orbit(0.1 * x, 0.1 * y)),
     move: (x, y, z) => nudge(() => page.camera.move(0.06 * x, 0.06 * y, 0.06 * z)),
     photo: () => $("blend").click(), fly: () => flyTo(page.chosen), like: () => like(page.chosen), level: setLevel, keep: keepAnswer, path: addToPath, frustums: showFrustums,

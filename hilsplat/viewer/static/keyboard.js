@@ -1,5 +1,7 @@
 // Keyboard shortcuts, which are ignored while the user types and don't override the keys of the browser or of controls.
 
+import { historyOf, isCommand, keyOf } from "./keys.js";
+
 const STEPS_PER_MS = 0.012, EASE_MS = 70;
 const TYPED = "input:not([type=radio]):not([type=checkbox]):not([type=range])";
 const ORBITS = { ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0] };
@@ -43,15 +45,15 @@ class Glide {
 
 export function attachKeys(act) {
   const glide = new Glide(act);
-  document.addEventListener("keyup", (event) => glide.held.delete(event.key.toLowerCase()));
+  document.addEventListener("keyup", (event) => glide.held.delete(keyOf(event)));
   window.addEventListener("blur", () => glide.held.clear());
   document.addEventListener("keydown", (event) => {
-    if ((event.ctrlKey || event.metaKey) && !event.target.closest(TYPED) && act.undone(event)) { event.preventDefault(); return; }
-    if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
-    const typing = event.target.closest(TYPED);
-    if (event.key === "Escape") { act.clear(); return; }
+    const typing = event.target.closest(TYPED), way = historyOf(event), key = keyOf(event);
+    if (way && !typing) { act[way](); event.preventDefault(); return; }
+    if (isCommand(event) || document.querySelector("dialog[open]")) return;
+    if (key === "Escape") { act.clear(); return; }
     if (typing) return;
-    const on = (selector) => event.target.closest(selector), letter = event.key.toLowerCase();
+    const on = (selector) => event.target.closest(selector);
     const keys = {
       "/": act.ask, "?": act.help, "[": () => act.step(-1), "]": () => act.step(1), "+": () => act.zoom(0.9), "=": () => act.zoom(0.9), "-": () => act.zoom(1 / 0.9),
       o: act.photo, f: act.fly, m: act.like, n: act.name, k: act.keep, v: act.path, p: act.frustums, g: act.mode, x: act.edit, u: act.parent, j: act.child,
@@ -59,11 +61,11 @@ export function attachKeys(act) {
     };
     if (on("select")) return;
     const free = on("#view") || event.target === document.body;   // lists and radio buttons use the arrow keys and Home themselves
-    if ((ORBITS[event.key] || event.key === "Home") && !free) return;
-    if (event.key === "Home") act.home();
-    else if (act.edited(letter)) { /* a key of the edit bar */ }
-    else if (ORBITS[event.key] || MOVES[letter]) { if (!event.repeat) glide.press(letter, ORBITS[event.key] ? "orbit" : "move", ORBITS[event.key] ?? MOVES[letter]); }
-    else if (keys[event.key] ?? keys[letter]) (keys[event.key] ?? keys[letter])();
+    if ((ORBITS[key] || key === "Home") && !free) return;
+    if (key === "Home") act.home();
+    else if (act.edited(key)) { /* a key of the edit bar */ }
+    else if (ORBITS[key] || MOVES[key]) { if (!event.repeat) glide.press(key, ORBITS[key] ? "orbit" : "move", ORBITS[key] ?? MOVES[key]); }
+    else if (keys[key]) keys[key]();
     else return;
     event.preventDefault();
   });

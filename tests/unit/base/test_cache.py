@@ -46,6 +46,22 @@ def left(cache: Path) -> list[str]:
     return sorted(path.relative_to(cache).as_posix() for path in cache.rglob("*.npz"))
 
 
+@pytest.mark.parametrize(("problem", "examined"), [("", 1), ("the build was killed", 2)])
+def test_a_problem_of_this_machine_is_examined_again_after_an_hour(tmp_path, monkeypatch, problem, examined):
+    monkeypatch.setattr("hilsplat.base.cache._folder", lambda kind: tmp_path / kind)
+    times = []
+
+    def examine() -> str:
+        times.append(1)
+        return problem
+
+    for age_s in (0, 60, 3660, 0):
+        assert remembered("cuda", "build", examine) == problem
+        (result,) = (tmp_path / "cuda").iterdir()
+        os.utime(result, (time.time() - age_s,) * 2)
+    assert len(times) == examined
+
+
 def test_the_table_names_each_cache(cache):
     lines = size_table(cache).splitlines()
     assert [line.split() for line in lines[1:]] == [

@@ -24,9 +24,9 @@ sys.stdin.read()
 
 @pytest.fixture(autouse=True)
 def no_scheduler(monkeypatch):
-    monkeypatch.delenv("SLURM_JOB_ID", raising=False)
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    monkeypatch.setenv("CUDA_DEVICE_ORDER", "PCI_BUS_ID")  # so that it is restored
+    for name in ("SLURM_JOB_ID", "CUDA_VISIBLE_DEVICES", "CUDA_DEVICE_ORDER"):
+        monkeypatch.setenv(name, "")  # so that it is restored
+        monkeypatch.delenv(name)
     yield
     release_card()
 
@@ -58,15 +58,17 @@ def test_without_a_driver_there_is_no_card(monkeypatch, tmp_path):
     assert cards() == [] and not list(tmp_path.iterdir())
 
 
-def test_under_slurm_the_scheduler_has_chosen(monkeypatch, tmp_path):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
-    monkeypatch.setenv("SLURM_JOB_ID", "7")
+@pytest.mark.parametrize("order", [None, "FASTEST_FIRST"])
+def test_the_order_that_gives_names_their_meaning_is_kept(monkeypatch, tmp_path, order):
+    if order:
+        monkeypatch.setenv("CUDA_DEVICE_ORDER", order)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
     take_card(tmp_path)
-    assert os.environ["CUDA_VISIBLE_DEVICES"] == "0" and not list(tmp_path.iterdir())
+    assert (os.environ["CUDA_VISIBLE_DEVICES"], os.environ.get("CUDA_DEVICE_ORDER")) == ("1", order)
 
 
-def holder(folder: Path, visible: str) -> subprocess.Popen:
-    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": visible}
+def holder(folder: Path, visible: str, **environment: str) -> subprocess.Popen:
+    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": visible, **environment}
     command = [sys.executable, "-P", "-c", HOLD, str(folder)]
     return subprocess.Popen(
         command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -88,3 +90,12 @@ def test_jobs_get_cards_of_their_own_and_wait_for_one(tmp_path, monkeypatch, cap
             assert third.stdout.readline() == f"{freed}\n"
             third.kill()
         first.kill()
+
+
+def test_processes_of_one_slurm_job_share_its_cards(tmp_path):
+    jobs = ("7", "7", "8")  # the scheduler names the cards of each job from 0
+    holders = [holder(tmp_path, "0,1", SLURM_JOB_ID=job) for job in jobs]
+    names = [each.stdout.readline().strip() for each in holders]
+    for each in holders:
+        each.communicate()
+    assert {*names[:2]} == {"0", "1"} and names[2] == "0"

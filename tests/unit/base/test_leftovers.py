@@ -156,7 +156,9 @@ def test_only_folders_of_unfinished_files_of_this_host_are_removed(tmp_path):
         (of_others / name).touch()
     kept.append(folder / f".writing-{processes.host_token()}-fedcba98")
     kept[-1].symlink_to(of_others)
-    assert processes.remove_leftovers(tmp_path) == [leftover]
+    (container := folder / ".writing-00000000-89abcdef").mkdir()  # of this machine, with another name
+    (container / ".lock").write_text(processes.boot_id())
+    assert sorted(processes.remove_leftovers(tmp_path)) == sorted([leftover, container])
     assert sorted(folder.iterdir()) == sorted(kept)
     assert (of_others / "drawing.png").exists()
     assert processes.remove_leftovers(tmp_path / "nowhere") == []

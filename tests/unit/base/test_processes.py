@@ -22,6 +22,7 @@ from hilsplat.base.processes import (
     in_order,
     in_own_process,
     in_processes,
+    num_cores,
 )
 
 
@@ -92,6 +93,32 @@ def test_a_job_does_not_start_once_its_workflow_has_ended():
     environment = {**os.environ, PARENT: f"{host_token()}:{gone.pid}"}
     job = subprocess.run([sys.executable, "-c", JOB], env=environment, capture_output=True, check=False)
     assert job.returncode == 1 and job.stdout == b""
+
+
+ZOMBIE = """
+import os, subprocess, sys, time
+from hilsplat.base.processes import parent_variable
+job = [sys.executable, "-c", sys.argv[1]]
+subprocess.Popen(["sh", "-c", '"$@"; true', "sh", *job], env=os.environ | parent_variable())
+"""
+
+
+def test_a_job_ends_with_a_workflow_that_nobody_awaits():
+    """In a container, the process with the id 1 may await no other; the workflow then stays as a zombie."""
+    workflow = subprocess.Popen([sys.executable, "-c", ZOMBIE, JOB], stdout=subprocess.PIPE)  # ends at once
+    assert workflow.communicate(timeout=15)[0] in (b"", b"started\n")  # awaits it after its jobs have ended
+
+
+def test_cores_are_those_of_the_quota(monkeypatch):
+    cores = len(os.sched_getaffinity(0))
+    for text, number in (
+        ("max 100000", cores),
+        ("100000 100000", 1),
+        ("50000 100000", 1),
+        ("9900000 100000", cores),
+    ):
+        monkeypatch.setattr(Path, "read_text", lambda *_, text=text, **__: text)
+        assert num_cores() == number
 
 
 def test_a_job_on_another_machine_of_a_cluster_runs(monkeypatch):

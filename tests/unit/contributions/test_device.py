@@ -1,6 +1,8 @@
 """Contributions on a simulated card, with gsplat's reference functions in torch."""
 
+import time
 from collections.abc import Callable
+from threading import Semaphore
 
 import gsplat
 import numpy as np
@@ -121,6 +123,23 @@ def test_the_stage_uses_a_card_only_on_request(two_boxes, draw_two_boxes):
         digests.add(sha256_of_path(out))
     assert len(digests) == 1  # W is the same here, and so are the sums of few weights
     assert ContributionsSettings().rasteriser == "cpu"  # and so the provenance record says
+
+
+def test_a_card_prepares_one_view_at_a_time(two_boxes, draw_two_boxes, monkeypatch):
+    compute, most, together = card.view_contributions, [0], Semaphore(1)
+
+    def watched(*given: object) -> dict[str, np.ndarray]:
+        is_alone = together.acquire(blocking=False)
+        most[0] += not is_alone
+        time.sleep(0.05)  # two threads would both be here
+        if is_alone:
+            together.release()
+        return compute(*given)
+
+    monkeypatch.setattr(card, "view_contributions", watched)
+    inputs = two_boxes.scene, two_boxes.ply, two_boxes.masks, two_boxes.folder / "out", two_boxes.folder / "c"
+    run_contributions(*inputs, ContributionsSettings(device="cuda"), 4)
+    assert len(draw_two_boxes) == 4 and most == [0]
 
 
 def test_memory_that_runs_out_is_an_error_with_a_fix(two_boxes, monkeypatch):

@@ -1,5 +1,7 @@
 """The evaluate and figures stages, and the scores of labels of published data sets."""
 
+import json
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -13,7 +15,7 @@ from hilsplat.datasets.registry import open_labelled
 from hilsplat.evaluate.costs import TIME_COLUMNS
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.figures import panel
-from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.protocols.view_truth import ViewTruth, truths_of
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 from tests.unit.evaluate.builders import box, region_of
 
@@ -102,6 +104,20 @@ def test_labels_give_the_scores_of_the_same_annotations_and_flat_ones_those_of_l
     assert held_out.reset_index(drop=True).equals(of_lerf.reset_index(drop=True))
 
 
+def test_annotations_of_scenes_with_one_name_in_two_data_sets_are_scores_of_two_scenes(opened, tmp_path):
+    folder = tmp_path / "annotated/lerf/blocks"
+    folder.mkdir(parents=True)
+    square = [[8, 8], [40, 8], [40, 40], [8, 40]]
+    bear = {"category": "bear", "segmentation": square, "bbox": [8, 8, 40, 40], "level": 1, "id": 1}
+    labels = {"info": {"width": 64, "height": 64, "name": "001.jpg"}, "objects": [bear]}
+    (folder / "001.json").write_text(json.dumps(labels))
+    (folder.parents[1] / "lerf_mask").symlink_to(folder.parent)
+    for data in ("lerf", "lerf_mask"):
+        own = {"labels": [f"annotated/{data}/blocks"], "data_root": tmp_path, "truth": None}
+        scores = opened.evaluate(tmp_path / "scores.csv", dataset=data, **own)
+        assert {*scores["dataset"]} == {"annotated"} and {*scores["scene"]} == {f"{data}/blocks"}
+
+
 def test_labelled_views_without_pose_and_labels_of_another_shape_are_refused(block_world, rows):
     with pytest.raises(SceneError, match=r"have no pose: 007\.png\n"):
         rows(labelled(block_world, views=("001.png", "007.png")))
@@ -140,6 +156,17 @@ def test_labels_shrink_as_public_evaluators_shrink_them():
     (dots,) = ViewTruth.of_regions([region_of(mask, "dots")], (16, 16), (34, 44)).categories
     assert dots.truth.all()
     small = Image.fromarray(mask).resize((5, 4), Image.Resampling.NEAREST)
+    np.testing.assert_array_equal(dots.eighth, np.asarray(small))
+
+
+def test_an_eighth_is_that_of_the_image_also_if_poses_shrank_it(block_world, tmp_path):
+    mask = np.random.default_rng(0).random((128, 128)) < 0.5
+    write_png(tmp_path / "001.png", np.zeros((128, 128, 3), np.uint8))
+    images, regions = {"001.png": tmp_path / "001.png"}, (region_of(mask, "dots"),)
+    known = LabelledScene("3d_ovs", "blocks", images, None, {"001.png": regions})
+    (dots,) = truths_of(known, block_world.scene, 0)["001.png"]().categories
+    assert dots.truth.shape == (64, 64)
+    small = Image.fromarray(mask).resize((16, 16), Image.Resampling.NEAREST)
     np.testing.assert_array_equal(dots.eighth, np.asarray(small))
 
 

@@ -286,6 +286,17 @@ def test_a_zip_is_unpacked_and_its_only_folder_unwrapped(tmp_path, photos_in_zip
     assert files == dict(photos_in_zip)
 
 
+@pytest.mark.parametrize("dry_run", [True, False])
+def test_of_an_archive_with_two_albums_one_must_be_unpacked(tmp_path, photos_in_zip, sheet, dry_run):
+    entries = [(f"{album}/{name}", content) for album in "ab" for name, content in photos_in_zip]
+    archive = zipped(tmp_path / "albums.zip", entries)
+    with pytest.raises(
+        SceneError, match=r"4 images in \S+/a/, (.|\n)*removed again(.|\n)*unpack albums\.zip"
+    ):
+        add_scene(sheet, "desk", archive, dry_run=dry_run)
+    assert not (tmp_path / "project/photos").exists() or not list((tmp_path / "project/photos").iterdir())
+
+
 def link(name):
     entry = zipfile.ZipInfo(name)
     entry.external_attr = (stat.S_IFLNK | 0o777) << 16

@@ -262,10 +262,14 @@ def test_masks_do_not_replace_the_picture_of_their_answer(desk, elsewhere):
     assert {path.name for path in Path("a").iterdir()} >= {"panel.png", "selection.ply", "masks"}
 
 
-def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path):
+def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path, monkeypatch):
     results = desk_project / "results"
     assert scene_folder("desk", results) == scene_folder("photos/desk", results) == results / "photos/desk"
     assert scene_folder(str(results / "photos/desk"), Path("elsewhere")) == results / "photos/desk"
+    (tmp_path / "lamp").mkdir()  # its photographs
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ArtifactError, match=r"results/lamp is missing(.|\n)*hilsplat run SCENE"):
+        scene_folder("lamp", Path("results"))
     for dataset in ("photos", "synthetic"):
         shutil.copytree(results / "photos/desk/scene", tmp_path / dataset / "desk/scene")
     with pytest.raises(SettingsError, match=r"several scenes(.|\n)*photos/desk, synthetic/desk"):
@@ -358,3 +362,15 @@ def test_key_views_are_queried_until_the_vectors_of_all_views_exist(desk, tmp_pa
     expected = [key / name for name in ("clip", "semantic_tree", "masks")]
     assert [parts.clip, parts.semantic_tree, parts.masks] == expected and parts.field is None
     assert re.search(r"photos/desk uses \d+ of \d+ photographs until the run ends", caplog.text)
+
+
+def test_results_of_another_user_answer_and_name_the_option_for_files(desk, capsys, monkeypatch):
+    can, own = os.access, str(desk)  # root may write everywhere
+
+    def access(path, mode: int, **more: bool) -> bool:
+        return can(path, mode, **more) and not (mode == os.W_OK and str(path).startswith(own))
+
+    monkeypatch.setattr(os, "access", access)
+    with pytest.raises(SettingsError, match=r"queries(.|\n)*cannot be written(.|\n)*--out"):
+        run("query", str(desk), "mug")
+    assert "mug" in capsys.readouterr().out and not (desk / "queries").exists()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilsplat.base.errors import ArtifactError, SettingsError
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS, Level, spelt
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.code import LanguageField, load_code
 from hilsplat.field.field import run_field
@@ -284,11 +284,45 @@ def test_a_variant_uses_the_parts_recorded_in_its_scores_or_those_that_exist(tmp
         FinishedScene.locate(folder, "x")
 
 
-def test_the_field_answers_through_the_same_interface(scene):
+def test_while_a_scene_is_rebuilt_new_parts_precede_those_of_the_previous_run(tmp_path, monkeypatch):
+    folder = bear_without(tmp_path)
+    monkeypatch.setattr("hilsplat.scene.finished.refining", lambda folder: "few photographs")
+    for part in ("clip", "masks", "semantic_tree"):
+        (folder / "key-views" / part).mkdir(parents=True)
+
+    def make(name: str, poses: str) -> None:
+        inputs = {"scene": {"path": str(folder / "scene"), "sha256": poses}}
+        write_record(folder / name, inputs=inputs)
+
+    def used() -> tuple[str, bool]:
+        parts = FinishedScene.locate(folder).parts
+        return parts.clip.parent.name, parts.field is not None
+
+    def rebuild(poses: str) -> None:
+        write_record(folder / "scene", outputs={"scene": {"sha256": poses, "bytes": {}}})
+
+    rebuild("old")
+    vectors = ("default/clip", "default/field.safetensors", "key-views/clip")
+    for name in vectors:
+        make(name, "old")
+    assert used() == ("default", True)
+    rebuild("new")
+    assert used() == ("default", True)  # nothing is new yet: opening it names what changed
+    for name, expected in (("key-views", False), ("default", False)):
+        make(f"{name}/clip", "new")
+        assert used() == (name, expected)
+    make("default/field.safetensors", "new")
+    assert used() == ("default", True)
+
+
+def test_the_field_answers_through_the_same_interface_and_by_look_ups(scene):
     hits = scene.query("B", "whole", answerer="field")
     assert hits[0].node == NODE["B"]
     (hit,) = scene.query("A > A top", answerer="field")
     assert (hit.node, hit.route) == (NODE["A top"], "child")
+    exact = scene.field.relevancy(["B", "A top"], "004.png")
+    fast = scene.field.relevancy(["B", "A top"], "004.png", exact=False)
+    assert fast == pytest.approx(exact, abs=2e-3)  # a network with d = 4: decoded as well
 
 
 @pytest.mark.parametrize(
@@ -322,6 +356,17 @@ def test_answers_in_a_view_are_nodes_that_it_shows(scene, text):
     assert dark.query(text, view="000.png") == []
     with pytest.raises(SettingsError, match="has no view 'x'"):
         scene.query(text, view="x")
+
+
+def test_views_are_found_however_their_names_are_composed(scene):
+    """macOS decomposes names of files, and keyboards type composed letters."""
+    stored, typed = "Gro\u0308ße.png", "Gr\u00f6ße.png"
+    cameras = replace(scene.scene.cameras, names=(stored, *scene.scene.cameras.names[1:]))
+    views = replace(scene.views, scene=replace(scene.scene, cameras=cameras))
+    assert cameras[typed].name == views.camera(typed).name == stored
+    assert spelt("000.png", cameras.names) is None
+    with pytest.raises(ArtifactError, match=stored):  # not the name that was typed
+        views.image(typed)
 
 
 def test_a_view_shows_the_nodes_with_a_mask_there(scene, monkeypatch):

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from itertools import product
@@ -16,7 +17,7 @@ from PIL.TiffImagePlugin import IFDRational
 from hilsplat.base import images
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.images import read_image
-from hilsplat.scene import mapping
+from hilsplat.scene import mapping, poses
 from hilsplat.scene.features import WorkImage, exif_focal_px, exif_time, lenses_of, prepare_images
 from hilsplat.scene.posed_images import PosedImage, write_posed_images
 from hilsplat.scene.poses import check_registration, name_neighbours, plot_lost, run_poses
@@ -132,6 +133,9 @@ def test_views_are_named_after_files_and_collisions_are_refused(tmp_path):
     assert view_names(twice) == ["train_r_0.png", "test_r_0.png"]
     with pytest.raises(SceneError, match=r"same view name 1\.png"):
         view_names([tmp_path / "1.jpg", tmp_path / "1.png"])
+    pairs = [tmp_path / f"IMG_{row}{suffix}" for row in range(9) for suffix in (".heic", ".jpg")]
+    with pytest.raises(SceneError, match=r"same view name IMG_0\.png, and so on for 9 names"):
+        view_names(pairs)
     with pytest.raises(SceneError, match="brace"):
         view_names([tmp_path / "a{1}.png"])
 
@@ -211,6 +215,48 @@ def test_an_unrelated_photograph_is_shown_in_the_report(tmp_path):
     assert views["other.png"]["belongs_near"] == []
     assert views["other.png"]["why_not"].startswith(("too few matches", "no features"))
     assert Image.open(tmp_path / "scene/registration.png").size[1] == 600 + 330
+
+
+def test_views_whose_lens_cannot_be_undone_are_left_out_with_advice(tmp_path, monkeypatch):
+    plane_views(tmp_path / "photos")
+    bent: list[str] = []
+
+    def map_views(*arguments):
+        models = mapping.map_views(*arguments)
+        for image in models[0].images.values():
+            if image.name in bent:
+                focal, x, y, _ = image.camera.params
+                image.camera.params = [focal, x, y, -1.5]  # turns back inside the image
+        return models
+
+    monkeypatch.setattr(poses, "map_views", map_views)
+    bent.append("000.png")
+    pose_photos(tmp_path / "photos", tmp_path / "scene", single_camera="no")
+    assert Scene.load(tmp_path / "scene").cameras.names == tuple(f"00{row}.png" for row in range(1, 5))
+    report = json.loads((tmp_path / "scene/registration.json").read_text())
+    assert report["views"]["000.png"]["why_not"] == "the lens distortion of view 000.png cannot be undone"
+    assert report["registered"] == 4 and any("camera_model: opencv" in each for each in report["warnings"])
+    with pytest.raises(RegistrationError, match=r"(?s)000\.png cannot be undone.*fix.*camera_model: opencv"):
+        pose_photos(tmp_path / "photos", tmp_path / "strict", single_camera="no", min_registered_share=1.0)
+    bent += [f"00{row}.png" for row in range(1, 5)]
+    with pytest.raises(RegistrationError, match=r"(?s)found     0 .*linear field of view"):
+        pose_photos(tmp_path / "photos", tmp_path / "none", single_camera="no")
+
+
+def test_copies_of_photographs_are_left_out(tmp_path):
+    photos = tmp_path / "photos"
+    plane_views(photos)
+    for name in ("000 copy.png", "0.png"):  # the shorter name is kept, not the first or last one
+        shutil.copy(photos / "000.png", photos / name)
+    pose_photos(photos, tmp_path / "scene", min_registered_share=1.0)
+    report = json.loads((tmp_path / "scene/registration.json").read_text())
+    assert (report["images"], report["registered"]) == (5, 5)
+    lost = {view: entry["why_not"] for view, entry in report["views"].items() if not entry["registered"]}
+    assert lost == {"000 copy.png": "a copy of 0.png", "000.png": "a copy of 0.png"}
+    for name in ("000.png", "001.png"):
+        (write_noise(tmp_path / "few", 1) / "0.png").rename(tmp_path / "few" / name)
+    with pytest.raises(SceneError, match=r"too few images(.|\n)*found +1\n"):
+        pose_photos(tmp_path / "few", tmp_path / "none")
 
 
 @pytest.mark.parametrize(("counts", "large", "threads"), [((5, 4, 3), 100, [2]), ((7, 6, 10), 12, [1, 2])])

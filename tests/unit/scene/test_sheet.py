@@ -1,6 +1,7 @@
 """The scene sheet: errors name the cell and the fix; new scenes are appended."""
 
 import json
+import os
 import shutil
 from collections.abc import Iterable
 from dataclasses import replace
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import ArtifactError, SceneError, SettingsError
 from hilsplat.photos.check import inspect_photos
 from hilsplat.scene.layouts import NO_POSES
 from hilsplat.scene.sheet import choose_scenes, read_sheet
@@ -85,7 +86,7 @@ def test_a_bad_cell_is_refused_with_line_and_column(tmp_path, column, cell, prob
         with pytest.raises(SceneError, match=problem):
             add_scene(sheet, cell, tmp_path)
     elif column in ("gaussians", "features", "poses") or cell in ("gone", "phone"):
-        assert len(read_sheet(sheet, checked_groups=("ci",))) == 1  # a group that is not run
+        assert len(read_sheet(sheet, ("ci/other",))) == 1  # it is not run
 
 
 @pytest.mark.parametrize(
@@ -244,7 +245,8 @@ def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
     assert "truncated" in unreadable["truncated.jpg"]
     assert report.passed_over == {".nef": 1, ".rw2": 1}
     assert "5 photographs in" in str(report) and "4  of 40 x 30 px" in str(report)
-    assert "1  are copies of others: 1.jpg = copy.jpg" in str(report)
+    assert "1  are copies of others and are left out: 1.jpg = copy.jpg" in str(report)
+    assert "1  are copies of others: 1.jpg" in str(replace(report, have_poses=True))  # all are used
     many = str(replace(report, duplicates=(("a.jpg", "b.jpg", "c.jpg"),) * 8))
     assert "16  are copies of others" in many and many.count("a.jpg = b.jpg = c.jpg") == 5
 
@@ -287,6 +289,46 @@ def test_a_path_that_the_sheet_cannot_hold_is_refused(tmp_path, path):
         with pytest.raises(SceneError, match="cannot be written to the scene sheet"):
             add_scene(sheet, "new", photos, features=features)
     assert sheet.read_bytes() == before
+
+
+@pytest.mark.parametrize("dry_run", [True, False])
+def test_files_that_a_run_would_refuse_are_refused_before(tmp_path, dry_run):
+    sheet = write_sheet(tmp_path, WORLD)
+    before = sheet.read_bytes()
+    with pytest.raises(SettingsError, match=r"photos/new: its name contains braces"):
+        add_scene(sheet, "new", write_noise(tmp_path / "desk {1}", 3), dry_run=dry_run)
+    folder = write_noise(tmp_path / "desk", 3)
+    os.utime(folder / "1.png", (2**32, 2**32))
+    with pytest.raises(ArtifactError, match=r"1\.png has a modification time in the future"):
+        add_scene(sheet, "new", folder, dry_run=dry_run)
+    assert sheet.read_bytes() == before
+
+
+def test_labels_of_the_future_are_copied_with_the_present_time(tmp_path):
+    folder, sheet = photographs(tmp_path / "desk"), write_sheet(tmp_path)
+    label_file(folder / "label/000.json", [{"category": "mug", "segmentation": [[1, 1], [9, 1], [9, 9]]}])
+    os.utime(folder / "label/000.json", (2**32, 2**32))
+    add_scene(sheet, "desk", folder)
+    copy = tmp_path / "annotated/photos/desk/000.json"
+    assert copy.stat().st_mtime < 2**32
+    os.utime(copy, (2**32, 2**32))
+    (row,) = read_sheet(sheet)
+    with pytest.raises(ArtifactError, match=r"000\.json has a modification time in the future"):
+        SceneData([row], str(tmp_path), str).require_usable_files(row)
+
+
+def test_photographs_that_are_not_used_are_counted_by_folder(tmp_path):
+    folder, sheet = write_noise(tmp_path / "desk", 4), write_sheet(tmp_path)
+    write_noise(folder / "burst", 3), write_noise(folder / "masks", 4)
+    for number in range(2):
+        (folder / f".IMG_{number}.HEIC.icloud").write_bytes(b"bplist00")
+    report = str(add_scene(sheet, "desk", folder))
+    assert f"  not used: 3 images in {folder}/burst/; to use them, move them to {folder}\n" in report
+    assert "  left out: 2 photographs that iCloud has not downloaded" in report
+    for path in folder.glob("[!.]*"):
+        path.unlink() if path.is_file() else shutil.rmtree(path)
+    with pytest.raises(SceneError, match=r"too few photographs(.|\n)*2 photographs that iCloud has not"):
+        add_scene(sheet, "later", folder)
 
 
 def test_new_columns_are_added_to_the_header_and_not_to_a_comment(tmp_path):

@@ -1,10 +1,12 @@
 """Threads, bands of tiles, and choice of the device."""
 
 import logging
+import os
 import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 
 from cpusplat import binning
 from hilsplat.base.errors import DeviceError
+from hilsplat.models.card import card_problem
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise import cuda, device, parity
 from hilsplat.splat.rasterise.api import draw, pixel_weights
@@ -60,8 +63,14 @@ def card(monkeypatch, tmp_path):
 
     An error instead of kernels is raised when they are loaded.
     """
-    monkeypatch.setattr(device, "find_spec", lambda name: name)
+    (tmp_path / "csrc.so").touch()  # kernels that were compiled elsewhere
+    gsplat = SimpleNamespace(submodule_search_locations=[str(tmp_path)])
+    monkeypatch.setattr(device, "find_spec", lambda name: gsplat)
+    monkeypatch.setattr(device, "cards", lambda: ["0"])
+    monkeypatch.setattr(device, "take_card", lambda: None)
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_capability", lambda: (8, 6))
+    monkeypatch.setattr("torch.cuda.get_arch_list", list)
     monkeypatch.setattr("torch.cuda.get_device_name", lambda: "a card")
     monkeypatch.setattr("ctypes.CDLL", lambda name: None)
     monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path)
@@ -74,22 +83,21 @@ def card(monkeypatch, tmp_path):
             loads.append(kernels)
             if isinstance(kernels, Exception):
                 raise kernels
-            if kernels is None:
-                raise AttributeError("'NoneType' object has no attribute 'spherical_harmonics_fwd'")
             return run(*arguments)
 
         module = SimpleNamespace(__version__="1.5.3", spherical_harmonics=spherical_harmonics)
         monkeypatch.setitem(sys.modules, "gsplat", module)
-        device.forget_cuda()
+        in_another_process()
         return loads
 
     yield with_kernels
-    device.forget_cuda()
+    in_another_process()
 
 
 def in_another_process() -> None:
     """Forget what a process remembers, but not what the user's cache holds."""
     device.cuda_problem.cache_clear()
+    card_problem.cache_clear()
     device.CHOSEN.clear()
 
 
@@ -107,7 +115,6 @@ def test_without_cuda_auto_selects_the_cpu_and_cuda_is_an_error(card, monkeypatc
 @pytest.mark.parametrize(
     ("kernels", "words"),
     [
-        (None, "no CUDA toolkit (nvcc) is installed"),
         (RuntimeError("Error building extension 'gsplat_cuda': [1/9] nvcc"), "Error building extension"),
         (subprocess.CalledProcessError(1, "where cl"), "where cl"),
         (ImportError("libcudart.so.12: cannot open shared object file"), "libcudart.so.12"),
@@ -129,15 +136,55 @@ def test_a_failing_build_of_gsplat_is_tried_once_and_selects_the_cpu(card, caplo
     assert device.choose_device("auto") == "cpu" and len(loads) == 2
 
 
-def test_a_folder_of_cuda_without_a_compiler_is_no_toolkit(monkeypatch, tmp_path):
-    # such as /usr/local/cuda in images for running CUDA programs
-    monkeypatch.setattr(cuda, "DEVICE", "cpu")
-    monkeypatch.setenv("CUDA_HOME", str(tmp_path))
+@pytest.mark.parametrize(("place", "variable"), [("bin", "CUDA_HOME"), ("other", "PATH")])
+def test_without_a_compiler_the_kernels_of_gsplat_must_have_been_compiled_elsewhere(
+    card, monkeypatch, tmp_path, place, variable
+):
+    loads = card(object())
+    monkeypatch.setenv("CUDA_HOME", str(tmp_path))  # an image for running CUDA programs has no nvcc
     monkeypatch.setenv("PATH", "")
-    monkeypatch.setitem(sys.modules, "gsplat.csrc", None)  # kernels that were compiled elsewhere
-    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", None)
-    del sys.modules["gsplat.cuda._backend"]
-    assert "no CUDA toolkit (nvcc) is installed" in device._build_failure()
+    assert device.expected_problem() is device.cuda_problem() is None
+    (tmp_path / "csrc.so").unlink()
+    loads.clear()
+    in_another_process()
+    assert device.choose_device("auto") == "cpu" and not loads
+    assert "no CUDA toolkit (nvcc) is installed" in device.expected_problem()
+    (tmp_path / place).mkdir()
+    (tmp_path / place / "nvcc").touch(0o755)
+    monkeypatch.setenv(variable, str(tmp_path if place == "bin" else tmp_path / place))
+    assert device.cuda_problem() is None and len(loads) == 1
+
+
+def test_a_plan_runs_no_kernels_but_uses_what_jobs_found(card, monkeypatch):
+    loads = card(RuntimeError("Error building extension"))
+    assert device.expected_problem() is None and not loads
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")  # jobs see one of two equal cards, and another PATH
+    monkeypatch.setenv("PATH", os.environ["PATH"] + ":/other")
+    assert device.choose_device("auto") == "cpu" and len(loads) == 1
+    assert "Error building extension" in device.expected_problem() and len(loads) == 1
+
+
+@pytest.mark.parametrize(
+    ("requested", "gsplat", "expected"),
+    [
+        ("cpu", True, []),
+        ("auto", False, []),
+        ("auto", True, ["take", "run", "release"]),
+        ("cuda", True, ["take", "run", "release"]),
+    ],
+)
+def test_a_job_takes_a_card_before_cuda_starts_and_only_if_it_may_use_it(
+    card, monkeypatch, requested, gsplat, expected
+):
+    events: list[str] = []
+    card(object(), lambda *arguments: events.append("run") or 1 / 0)
+    monkeypatch.setattr(device, "take_card", lambda: events.append("take"))
+    monkeypatch.setattr(device, "release_card", lambda: events.append("release"))
+    if not gsplat:
+        monkeypatch.setattr(device, "find_spec", lambda name: None)
+    with pytest.raises(DeviceError) if requested == "cuda" else nullcontext():
+        assert device.choose_device(requested) == "cpu"
+    assert events == expected
 
 
 @pytest.mark.parametrize("requested", ["auto", "cuda"])
@@ -163,11 +210,20 @@ def test_a_card_that_is_full_for_a_while_is_used_afterwards(card, monkeypatch, c
 
 def test_a_build_that_failed_for_one_card_is_tried_for_another(card, monkeypatch):
     loads = card(RuntimeError("Unsupported gpu architecture 'compute_120'"))
-    for name in ("0", "0", "1"):
-        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", name)
+    for capability in ((12, 0), (12, 0), (8, 6)):
+        monkeypatch.setattr("torch.cuda.get_device_capability", lambda now=capability: now)
         in_another_process()
         assert device.choose_device("auto") == "cpu"
     assert len(loads) == 2
+
+
+def test_a_card_for_which_torch_has_no_kernels_is_not_used_for_fits(card, monkeypatch, caplog):
+    loads = card(object())
+    monkeypatch.setattr("torch.cuda.get_device_capability", lambda: (6, 1))
+    monkeypatch.setattr("torch.cuda.get_arch_list", lambda: ["sm_75", "sm_90"])
+    assert "no kernels for compute capability 6.1" in device.expected_problem()
+    assert device.choose_device("auto") == "cpu" and not loads
+    assert [each.levelname for each in caplog.records] == ["WARNING"]
 
 
 def test_a_self_test_that_fails_selects_the_cpu(card, caplog):

@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import gsplat
 import numpy as np
@@ -11,6 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from cpusplat import photometric
 from hilsplat.base.errors import DeviceError, HilsplatError
+from hilsplat.base.lineage import read_provenance
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat import fit, torch_model
@@ -19,6 +21,7 @@ from hilsplat.splat.initial import camera_extent, first_gaussians, load_views
 from hilsplat.splat.model import TABLES, Model, StepOptions
 from hilsplat.splat.rasterise import cuda, device, parity
 from hilsplat.splat.torch_model import TorchModel, bytes_needed
+from hilsplat.stages import gaussians
 from tests.unit.card_on_cpu import replace_kernels
 from tests.unit.splat.rasterise_scenes import random_gaussians
 from tests.unit.splat.three_gaussians_world import three_gaussians_scene
@@ -248,8 +251,8 @@ def test_too_small_a_card_is_an_error_or_selects_the_cpu(scene, monkeypatch, cap
     with caplog.at_level(logging.WARNING):
         assert fit.fit_device(scene, large.model_copy(update={"device": "auto"})) == "cpu"
     assert "about 3." in caplog.text and "gaussians.image_scale" in caplog.text
-    assert device.choose_device("auto") == "cpu"  # and so the provenance record says
     monkeypatch.setattr(device, "free_mib", lambda: 2.0**12)
+    assert fit.fit_device(scene, large.model_copy(update={"device": "auto"})) == "cuda"  # a later fit
     assert fit.fit_device(scene, large) == "cuda"
     # frozen points are not limited by max_gaussians
     frozen = large.model_copy(update={"initial": "frozen"})
@@ -271,6 +274,21 @@ def test_memory_that_runs_out_in_a_fit_is_an_error_with_a_fix(scene, monkeypatch
     monkeypatch.setattr(gsplat, "rasterization", fail)
     with pytest.raises(DeviceError, match=r"(?s)needs more memory.*out of memory.*gaussians.max_gaussians"):
         fit.fit_gaussians(scene, SETTINGS, seed=0)
+
+
+def test_provenance_records_the_device_that_a_fit_chose(scene, tmp_path, monkeypatch):
+    settings = SETTINGS.model_copy(update={"device": "auto", "iterations": 2})
+
+    def recorded(name: str, *free_mib: float, **options: Path) -> str | None:
+        left, out = [*free_mib], tmp_path / name / "g.ply"
+        monkeypatch.setattr(device, "free_mib", lambda: left.pop(0))
+        gaussians(scene.folder, out, out.with_name("report"), settings, cache=tmp_path / "cache", **options)
+        return read_provenance(out).device
+
+    # other programs may fill the card after the choice
+    assert recorded("card", 2.0**20, 0.0) == "cuda"
+    assert recorded("full", 0.0) == "cpu"
+    assert recorded("imported", existing=tmp_path / "card/g.ply") is None
 
 
 # ---- self-test ------------------------------------------------------------------------------------
@@ -306,15 +324,16 @@ def test_the_self_test_detects_other_conventions(monkeypatch, module, name, valu
     torch_model._taps.cache_clear()
 
 
-def test_the_self_test_is_repeated_after_a_new_driver(monkeypatch, tmp_path):
+def test_the_self_test_is_repeated_after_a_new_driver_or_library(monkeypatch, tmp_path):
     monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path)
     monkeypatch.setattr("torch.cuda.get_device_name", lambda: "a card")
-    driver, tests = ["550.1"], list[str]()
-    monkeypatch.setattr(parity, "driver_version", lambda: driver[0])
-    monkeypatch.setattr(parity, "disagreement", lambda *devices: tests.append(driver[0]))
-    for driver[0] in ("550.1", "550.1", "560.2"):
+    known, tests = ["550.1", None], list[object]()
+    monkeypatch.setattr(parity, "driver_version", lambda: known[0])
+    monkeypatch.setattr(parity, "version_of", lambda name: known[1] if name == "fused-ssim" else "1")
+    monkeypatch.setattr(parity, "disagreement", lambda *devices: tests.append(tuple(known)))
+    for known[:] in (("550.1", None), ("550.1", None), ("560.2", None), ("560.2", "0.2")):
         assert parity.cuda_disagreement() is None
-    assert tests == ["550.1", "560.2"]
+    assert tests == [("550.1", None), ("560.2", None), ("560.2", "0.2")]
 
 
 # ---- on a card ------------------------------------------------------------------------------------

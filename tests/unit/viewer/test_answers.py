@@ -138,6 +138,23 @@ def test_a_picture_cannot_choose_its_decoder(client, tmp_path, monkeypatch):
     assert client.post("/api/like", json=sent).status_code == 422
 
 
+def test_names_that_another_server_gave_are_found_and_do_not_block_naming(own_desk):
+    with browsing(ViewerScene(own_desk)) as first, browsing(ViewerScene(own_desk)) as second:
+        for client in (first, second):
+            ask(client, "mug")  # opens the variant
+        for client, node, name in ((first, 0, "my mug"), (second, 1, "my book"), (first, 2, "my lamp")):
+            outline = client.get("/api/variant/default").json()
+            names = {row: each["name"] for row, each in enumerate(outline["nodes"]) if each["name"]}
+            assert client.get("/api/changes").json()["names"]["default"] == outline["version"]
+            sent = {
+                "headers": {"if-match": f'"{outline["version"]}"'},
+                "json": {"names": {**names, node: name}},
+            }
+            assert client.put("/api/names", **sent).status_code == 200
+        for client in (first, second):
+            assert [hit["node"] for hit in ask(client, "my book")["hits"]] == [1]
+
+
 def test_field_relevancy_of_every_gaussian(client, scene, shown):
     def field(**more) -> np.ndarray:
         sent = client.post("/api/field", json={"text": "mug", "level": "whole", **more})

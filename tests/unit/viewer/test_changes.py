@@ -51,6 +51,13 @@ def test_a_rewritten_part_is_reported_until_a_reload(page, own_desk):
         assert state != before and ask(page, state).status_code == 200
 
 
+def test_another_inode_of_the_same_file_is_no_change(page, own_desk):
+    """On exFAT, the kernel assigns inode numbers whenever it loads a file."""
+    shutil.copy2(own_desk / "gaussians.ply", own_desk / "other")
+    (own_desk / "other").replace(own_desk / "gaussians.ply")
+    assert news(page)["changed"] == [] and load(page) == page.state
+
+
 def test_opened_parts_can_still_be_queried(page, own_desk):
     before = ask(page).json()["hits"]
     (own_desk / "gaussians.ply").unlink()

@@ -62,15 +62,22 @@ def test_a_library_that_is_missing_or_old_is_named(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("problem", "apart", "state"),
-    [("no gsplat", None, "note"), (None, "cuda differs from cpu: image by 0.3", "fault"), (None, None, "ok")],
+    ("absent", "problem", "apart", "state", "words"),
+    [
+        ("no driver", "no driver", None, "note", "no driver: everything runs on the CPU"),
+        (None, "no gsplat", None, "note", "no gsplat: fits and contributions run on the CPU"),
+        (None, None, "cuda differs from cpu: image by 0.3", "fault", "differs"),
+        (None, None, None, "ok", "agree"),
+    ],
 )
-def test_cuda_is_optional_but_must_agree_with_the_cpu(monkeypatch, problem, apart, state):
+def test_cuda_is_optional_but_must_agree_with_the_cpu(monkeypatch, absent, problem, apart, state, words):
+    monkeypatch.setattr("hilsplat.models.card.card_problem", lambda: absent)
     monkeypatch.setattr("hilsplat.splat.rasterise.device.forget_cuda", lambda: None)
     monkeypatch.setattr("hilsplat.splat.rasterise.device.cuda_problem", lambda: problem)
     monkeypatch.setattr("hilsplat.splat.rasterise.device.kernel_problem", lambda: None)
     monkeypatch.setattr("hilsplat.splat.rasterise.parity.cuda_disagreement", lambda: apart)
-    assert [found.state for found in doctor.cuda()] == [state]
+    (found,) = doctor.cuda()
+    assert found.state == state and words in found.found
 
 
 def test_a_broken_model_is_a_fault_and_missing_real_ones_are_noted(tmp_path, monkeypatch):
@@ -93,8 +100,25 @@ def test_a_model_must_give_the_same_on_a_card(project, monkeypatch, shift, state
     findings = [finding for finding in doctor.models() if finding.state != "note"]
     assert {finding.state for finding in findings} == {state} and len(findings) == 2
     monkeypatch.setattr(TorchNetwork, "run", Mock(side_effect=torch.OutOfMemoryError("Tried to allocate")))
-    findings = [finding for finding in doctor.models() if finding.state != "note"]
-    assert all("Tried to allocate" in each.found and "clip.device: cpu" in each.fix for each in findings)
+    findings = [each for each in doctor.models() if "works on the CPU, but not on the GPU" in each.found]
+    assert [each.state for each in findings] == ["note", "note"]
+    assert all("Tried to allocate" in each.found for each in findings)
+
+
+def test_a_card_that_is_too_small_or_busy_is_not_compared_and_is_no_fault(project, monkeypatch):
+    monkeypatch.chdir(project)
+    monkeypatch.setattr("hilsplat.embed.model_check.check_model", lambda folder: "")
+    monkeypatch.setattr("hilsplat.models.card.card_problem", lambda: None)
+    monkeypatch.setattr(TorchNetwork, "run", lambda *given, **feeds: pytest.fail("it ran"))
+    busy = RuntimeError("CUDA error: all CUDA-capable devices are busy or unavailable")
+    for free, words in (
+        (Mock(return_value=1.0), "the GPU has 0.0 GiB free"),
+        (Mock(side_effect=busy), "busy"),
+    ):
+        monkeypatch.setattr("hilsplat.models.card.free_mib", free)
+        findings = list(doctor.models())
+        assert {each.state for each in findings} == {"note"}
+        assert sum(words in each.found for each in findings) == 2
 
 
 @pytest.mark.parametrize(("what", "value"), [("disk", 2**20), ("memory", 100.0)])

@@ -111,7 +111,41 @@ def test_first_answer_and_all_photographs_are_predicted(photographs):
     (line,) = estimate.forecasts(found, 2)
     # 15 training views: 150 + 7.5 x 20 + 75 + 400 x 3 x 0.1 = 495 core seconds, then 7.5 x 12.3 + 150 + 200
     assert line.startswith("photos/desk: first answer in about 4 min, all photographs in about 8 min.")
-    assert "On one of 2 cores, SAM takes 20 s per photograph, and CLIP 0.10 s per crop" in line
+    assert (
+        "SAM takes 20.0 s per photograph on one of 2 cores, and CLIP 0.1 s per crop on one of 2 cores" in line
+    )
+    assert "GPU" not in line
+
+
+@pytest.mark.parametrize(
+    ("key_views", "words"),
+    [
+        # 150 + 15 x 60 + 150 + 400 x 5 x 0.3 = 1800 s
+        (False, "desk: all photographs in about 30 min."),
+        # half of the 15 views, and 400 x 3 crops: 150 + 450 + 75 + 360 = 1035 s, then 450 + 150 + 600
+        (True, "desk: first answer in about 17 min, all photographs in about 37 min."),
+    ],
+)
+def test_jobs_on_a_card_are_predicted_without_measuring_the_cpu(photographs, monkeypatch, key_views, words):
+    monkeypatch.setattr("hilsplat.embed.model_check.seconds_of", lambda *given: pytest.fail("it measured"))
+    monkeypatch.setattr("hilsplat.workflow.resources.cards", lambda: ["0"])
+    for name in ("card_problem", "expected_problem"):
+        monkeypatch.setattr(f"hilsplat.workflow.resources.{name}", lambda: None)
+    monkeypatch.setitem(estimate.GPU, "clip_crop_s", 0.3)
+    seconds = {"gaussians": lambda masks: 75.0, "masks": lambda masks: 17 * masks.key_views * 60.0}
+    monkeypatch.setattr(
+        estimate.JobResources,
+        "card_seconds",
+        lambda self, rule, job: seconds[rule](self.plan.stages(job).masks),
+    )
+    config = {"variants": {"key-views": KEY_VIEWS}} if key_views else {}
+    found = plan_of(photographs, (DESK,), groups=["photos"], main_variants=["default"], **config)
+    monkeypatch.setattr(
+        estimate.JobResources, "core_seconds", lambda self, rule, job: 75.0 if rule != "gaussians" else 1e6
+    )
+    line, note = estimate.forecasts(found, 1)
+    assert words in line and "SAM takes 60.0 s per photograph on the GPU, and CLIP 0.3 s per crop" in line
+    assert "estimated, not measured" in note
 
 
 def test_without_key_views_there_is_one_time(photographs):

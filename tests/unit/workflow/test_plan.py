@@ -17,7 +17,7 @@ from hilsplat.stage import PathOut, Registry
 from hilsplat.stages import all_stages, stage_of
 from hilsplat.workflow import targets
 from hilsplat.workflow.models import models_of_photographs, settings_of_photographs
-from hilsplat.workflow.plan import Plan, any_of, without_scene
+from hilsplat.workflow.plan import UNCOMPARED, Plan, any_of, without_scene
 from tests.conftest import PROJECT
 from tests.unit.models.test_store import write_model
 from tests.unit.workflow.plans import BENCHMARK, Job, plan_of, write_sheet
@@ -180,7 +180,7 @@ def test_imported_masks_get_the_levels_of_the_variant_and_need_no_model(tmp_path
     assert [(each.levels, each.uses_model) for each in levels] == [("head", False), ("tree", False)]
     assert levels[1].theta == 0.7
     values = found.params("imported_masks")["settings"](jobs[1])
-    assert found.settings("masks", jobs[1]) in values  # as `workflow.records` expects
+    assert found.settings("masks", jobs[1], UNCOMPARED) in values  # as `workflow.records` expects
     first, other = (found.identity("clip", variant, (), True) for variant in ("default", "tree"))
     assert first != other and first.stages == other.stages == ("imported_clip", "imported_masks")
 
@@ -211,6 +211,18 @@ def test_the_folder_of_data_sets_counts_for_scenes_that_read_it(tmp_path):
         for job, is_read in ((Job(), False), (Job("photos", "desk"), True)):
             here, moved = (each.params(name)["settings"](job) for each in plans)
             assert (here == moved) is not is_read and ("--data-root" in here) is is_read
+
+
+@pytest.mark.parametrize("stage", ["gaussians", "masks", "clip", "contributions"])
+def test_another_device_changes_the_command_but_reruns_nothing(tmp_path, stage):
+    files, outputs = SimpleNamespace(), SimpleNamespace(out="results/synthetic/one/default/x", report="r")
+    by_device = [plan(tmp_path, **{stage: {"device": device}}).params(stage) for device in ("auto", "cpu")]
+    commands = [params["command"](Job(), files, outputs) for params in by_device]
+    assert ['"device":"auto"' in command for command in commands] == [True, False]
+    assert '"device":"cpu"' in commands[1]
+    for name in ("settings", "code"):
+        auto, cpu = (params[name](Job()) for params in by_device)
+        assert auto == cpu
 
 
 @pytest.mark.parametrize(
@@ -352,6 +364,21 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
     assert not plan(tmp_path, **(config | {"variants": {}})).first_answer(desk)
 
 
+def test_the_missing_folder_of_another_scene_stops_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "hilsplat.workflow.plan.planned_model", lambda folder: SimpleNamespace(embedded=False)
+    )
+    rows = (*ROWS, f"photos gone photos {tmp_path / 'gone'} arbitrary")
+    (tmp_path / "desk").mkdir()
+    (tmp_path / "desk/1.jpg").touch()
+    found = plan_of(
+        tmp_path, rows, variants={"key-views": {"masks": {"key_views": 0.5}}}, only=["photos/desk"]
+    )
+    assert [row.name for row in found.scenes] == ["photos/desk"] and found.jobs_of("key_masks")
+    with pytest.raises(SceneError, match=r"gone is missing"):
+        plan_of(tmp_path, rows, only=["photos/gone"])
+
+
 @pytest.mark.parametrize("beside", ["input", "images_train", "object_mask", "images_4"])
 def test_other_copies_of_photographs_are_not_counted(tmp_path, beside):
     for folder in ("sparse/0", "images", beside):
@@ -401,6 +428,90 @@ def test_tables_have_their_own_scenes_and_variants(tmp_path):
     assert targets.scores(found, "waymo") == []
     with_network = plan(tmp_path, main_variants=["default", "network"], seeds=2)
     assert variants_in(targets.scores(with_network, "replica")) == ["default", "network", "network.seed1"]
+
+
+OF_BENCHMARKS = (
+    *(f"lerf {name} lerf data:lerf_ovs/{name} arbitrary" for name in ("figurines", "ramen")),
+    *(f"3d_ovs {name} 3d_ovs data:3d_ovs/{name} arbitrary" for name in ("bed", "snacks")),
+    "synthetic one benchmark world:tabletop:1 metre",
+    "rooms room benchmark world:room:1 metre",
+)
+
+
+def plan_of_benchmarks(folder: Path, *label_files: str, **config: object) -> Plan:
+    """The plan of scenes of LERF and 3D-OVS with their own labels, and with the given label files."""
+    places = [
+        f"lerf_ovs/{part}"
+        for name in ("figurines", "ramen")
+        for part in (f"{name}/sparse/0", f"label/{name}")
+    ]
+    places += [f"lerf_ovs/{name}/images" for name in ("figurines", "ramen")]
+    places += [f"3d_ovs/{name}/{part}" for name in ("bed", "snacks") for part in ("images", "segmentations")]
+    for place in places:
+        (folder / place).mkdir(parents=True, exist_ok=True)
+    files = [f"3d_ovs/{name}/segmentations/classes.txt" for name in ("bed", "snacks")]
+    for file in (*files, *label_files):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).touch()
+    defaults = {"groups": ["lerf", "3d_ovs"], "data_root": str(folder), "main_variants": ["default"]}
+    sweeps = {"theta_variants": ["theta"], "pruning_variants": ["omega"]}
+    return plan_of(folder, OF_BENCHMARKS, **{"variants": VARIANTS, **defaults, **sweeps, **config})
+
+
+def test_tables_of_levels_have_the_scenes_whose_labels_have_levels(tmp_path):
+    def scenes(found, table):
+        return ["/".join(path.split("/")[1:3]) for path in targets.scores(found, table)]
+
+    tables = ("theta", "pruning", "hierarchy")
+    found = plan_of_benchmarks(tmp_path, groups=["lerf", "3d_ovs", "benchmark"])
+    assert [scenes(found, name) for name in tables[:2]] == [["synthetic/one"]] * 2
+    assert scenes(found, "lerf") == ["lerf/figurines", "lerf/ramen", "synthetic/one"]
+    assert {line.partition(" has ")[0] for line in targets.absent(found, "theta")} == {
+        f"hi_lerf (figurines, ramen): {tmp_path}/hi_lerf",
+        f"hi_3dovs (bed, snacks): {tmp_path}/hi_3dovs",
+    }
+    assert targets.absent(found, "lerf") == []
+    own = "annotated/lerf/ramen/1.json"
+    assert [scenes(plan_of_benchmarks(tmp_path / "own", own), name) for name in tables] == [
+        ["lerf/ramen"]
+    ] * 3
+    # rows of Hi-LERF have a column of 3D-OVS in sweeps, over scenes that are averaged, but not in pruning
+    found = plan_of_benchmarks(tmp_path / "hi", "hi_lerf/label/figurines/1.json")
+    of_lerf = ["lerf/figurines"]
+    assert [scenes(found, name) for name in tables] == [[*of_lerf, "3d_ovs/bed"], of_lerf, of_lerf]
+    assert targets.absent(found, "frames-hi-lerf") == [
+        f"hi_lerf (ramen): {tmp_path}/hi/hi_lerf has no labels with levels."
+    ]
+
+
+def test_a_run_of_some_scenes_makes_their_tables_and_names_the_scenes_left_out(tmp_path, monkeypatch):
+    def tables(found):
+        return [Path(path).stem for path in targets.default(found) if "/tables/" in path]
+
+    monkeypatch.chdir(tmp_path)
+    found = plan_of_benchmarks(tmp_path)
+    assert "results/figures/sweep-theta.png" in targets.default(found), "a first run makes all tables"
+    for path in map(Path, targets.tables(found)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    assert tables(found) == ["lerf", "3dovs", "cost", "cost-seconds"]
+    assert "results/figures/sweep-theta.png" not in targets.default(found)
+    one = plan_of_benchmarks(tmp_path, only=["lerf/ramen"])
+    assert tables(one) == ["lerf", "cost", "cost-seconds"]
+    assert len(targets.tables(one)) > 10, "the rule `tables` makes all"
+    assert {"lerf", "hierarchy", "theta"} <= {*tables(plan_of_benchmarks(tmp_path, groups=["benchmark"]))}
+    # A data set of the run that is missing is listed in its table.
+    rows = (*OF_BENCHMARKS, "waymo street waymo data:waymo/street metre")
+    lacking = {"groups": ["lerf", "waymo"], "data_root": str(tmp_path)}
+    assert {"lerf", "waymo"} <= {*tables(plan_of(tmp_path, rows, **lacking))}
+    assert "waymo" not in tables(plan_of(tmp_path, rows, **lacking, only=["ramen"]))
+
+    assert targets.left_out(one) == []
+    for scene in ("lerf/figurines", "synthetic/one", "rooms/room", "lerf/ramen"):
+        file = Path("results", scene, "default/scores.csv")
+        file.parent.mkdir(parents=True)
+        file.touch()
+    assert targets.left_out(one) == ["lerf/figurines", "synthetic/one"]  # rooms have other tables
 
 
 def test_a_run_of_photographs_leaves_tables_alone(tmp_path):

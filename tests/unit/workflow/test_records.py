@@ -63,6 +63,7 @@ def problems(*, every_byte: bool = False, **config: object) -> dict[str, str]:
         ),
         ({"masks": {"segmenter": "truth-perturbed"}}, {"masks": "by stage masks, not truth_masks"}),
         ({"evaluate": {"ancestors": 0.3}}, {}),
+        ({"masks": {"device": "cpu"}}, {}),  # the advice of a card without enough memory
     ],
 )
 def test_other_settings_are_found(results, config, reasons):

@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -127,7 +128,7 @@ def test_jobs_that_use_a_card_request_one(
 ):
     monkeypatch.setattr("hilsplat.workflow.resources.cards", lambda: on_machine)
     monkeypatch.setattr("hilsplat.workflow.resources.card_problem", lambda: None)
-    monkeypatch.setattr("hilsplat.workflow.resources.cuda_problem", lambda: gsplat_problem)
+    monkeypatch.setattr("hilsplat.workflow.resources.expected_problem", lambda: gsplat_problem)
     sections = ("gaussians", "masks", "clip", "contributions")
     config = {section: {"device": device} for section in sections}
     config["masks"]["segmenter"] = segmenter
@@ -164,6 +165,33 @@ def test_the_number_of_gaussians_is_read_from_the_header_of_a_ply(tmp_path):
     assert vertex_count(tmp_path / "existing.ply") == 812_430
     (tmp_path / "other.ply").write_bytes(b"element vertexes 3")
     assert vertex_count(tmp_path / "other.ply") is None and vertex_count(tmp_path / "none.ply") is None
+
+
+def test_frozen_gaussians_are_counted_in_the_mesh(tmp_path):
+    scan = tmp_path / "scannet/scans/scene0000_00"
+    for part in ("color/0.jpg", "pose/0.txt", "intrinsic/intrinsic_color.txt"):
+        (scan / part).parent.mkdir(parents=True, exist_ok=True)
+        (scan / part).touch()
+    rows, job = (
+        ("scannet scene0000_00 scannet data:scannet/scene0000_00 metre",),
+        Job("scannet", "scene0000_00"),
+    )
+
+    def costs(vertices: int, **fit: object) -> list[float]:
+        header = f"ply\nformat binary_little_endian 1.0\nelement vertex {vertices}\nend_header\n"
+        for name in ("ply", "labels.ply", "0.010000.segs.json"):
+            (scan / f"scene0000_00_vh_clean_2.{name}").write_text(header)
+        (scan / "scene0000_00.aggregation.json").touch()
+        config = {"data_root": str(tmp_path), "gaussians": {"max_gaussians": 2_000_000, **fit}}
+        found = JobResources(plan_of(tmp_path, rows, groups=["scannet"], **config))
+        of_job = [
+            getattr(found, name)("gaussians", job) for name in ("core_seconds", "card_seconds", "disk_mb")
+        ]
+        return [found.gaussians(found.plan.scenes[0]), *of_job]
+
+    small, large, growing = costs(80_000, initial="frozen"), costs(200_000, initial="frozen"), costs(80_000)
+    assert [each[0] for each in (small, large, growing)] == [80_000, 200_000, 2_000_000]
+    assert all(low < middle < high for low, middle, high in zip(small, large, growing, strict=True))
 
 
 def test_memory_grows_with_the_model_and_with_views_at_once(tmp_path):
@@ -215,6 +243,33 @@ def test_masks_of_a_data_set_count_as_queries(tmp_path):
     rows = ("3d_ovs bed 3d_ovs data:3d_ovs/bed arbitrary", "synthetic one benchmark world:tabletop:1 metre")
     found = plan_of(tmp_path, rows, groups=["3d_ovs", "benchmark"], data_root=str(tmp_path))
     assert [found.data.num_labelled(row) for row in found.rows] == [4, 0]
+
+
+def test_imported_gaussians_masks_and_vectors_cost_neither_a_fit_nor_a_model(tmp_path, monkeypatch):
+    """The full-size models would take hours for 40 views."""
+    monkeypatch.setenv("HILSPLAT_MODELS", str(tmp_path / "none"))
+    sections = {
+        "masks": {"segmenter": "sam", "model": "models/sam-vit-huge"},
+        "clip": {"model": "models/clip-vit-b-16-laion2b"},
+        "world": {"views": 40, "image_px": 512},
+    }
+    found = JobResources(plan(tmp_path, **sections), cores=2)
+    (row,), computed = found.plan.rows, {}
+    for rule in ("gaussians", "masks", "clip"):
+        card_s = found.card_seconds(rule, JOB)
+        computed[rule] = found.core_seconds(rule, JOB), found.memory_mb(rule)(JOB, 1, 1)
+        assert card_s and card_s < computed[rule][0]
+    assert found.candidates("masks", JOB)
+    imported = replace(row, gaussians=tmp_path / "a.ply", features=tmp_path)
+    monkeypatch.setattr(found.plan, "row", lambda job: imported)
+    monkeypatch.setattr(found, "size", lambda row: Size(40, 0.26))
+    assert found.candidates("masks", JOB) is None
+    for rule, stage in (("gaussians", "gaussians"), ("imported_masks", "masks"), ("imported_clip", "clip")):
+        seconds, memory_mb = computed[stage]
+        assert found.card_seconds(rule, JOB) is None
+        assert 2 <= found.core_seconds(rule, JOB) <= 62 < seconds
+        assert found.minutes(rule)(JOB, 1, 1) == 10
+        assert found.memory_mb(rule)(JOB, 1, 1) <= memory_mb - (1000 if stage == "masks" else 0)
 
 
 def test_a_released_model_has_its_cost_before_it_is_fetched(tmp_path, monkeypatch):

@@ -13,10 +13,11 @@ import pytest
 
 from hilsplat.base.artifacts import run_command
 from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.base.processes import boot_id
 from hilsplat.cli.main import app
 from hilsplat.workflow import run as runs
 from hilsplat.workflow.plan import Plan
-from tests.unit.workflow.plans import write_sheet
+from tests.unit.workflow.plans import plan_of, write_sheet
 
 HOLD = """
 import sys, time
@@ -197,6 +198,12 @@ def test_the_locks_of_another_machine_stay(folder, started, unlocked, caplog):
     assert unlocked == [] and "another machine may be running" in caplog.text
     runs.run([], [], ["--unlock"])
     assert "unlock" in unlocked and list(runs.STATE.glob("run-*")) == []
+    unlocked.clear()
+    leave_marker(
+        f"elsewhere {boot_id()}"
+    )  # a container of this machine, which has another name at each start
+    runs.run([], [], [])
+    assert unlocked == ["unlock"]
 
 
 def test_options_of_the_command_need_no_separator(folder, started, monkeypatch):
@@ -224,9 +231,24 @@ def test_a_configuration_is_found_by_its_name(folder, project, started):
 
 def test_a_run_records_installed_configurations_by_name_for_the_commands_of_messages(folder, project):
     Path("config/mine.yaml").write_text("")
-    runs.record_run(Path("results"), [project / "config/ci.yaml", folder / "config/mine.yaml"], {})
+    configs = [project / "config/ci.yaml", folder / "config/mine.yaml"]
+    runs.record_run(plan_of(folder), configs, {})
     command = "hilsplat run --config ci --config config/mine.yaml results/a/b/scene"
     assert run_command(Path("results/a/b/scene")) == command
+
+
+def test_messages_suggest_the_options_of_the_last_run_of_a_scene(folder, project):
+    runs.record_run(plan_of(folder, only=["two"]), [project / "config/demo.yaml"], {"data_root": "/data"})
+    runs.record_run(plan_of(folder, only=["one"]), [], {"seed": 5})
+    options, last = "-- --config 'data_root=\"/data\"'", "-- --config seed=5"
+    for path in ("synthetic/two/default/masks", "figures/synthetic/two/panel.webp", "synthetic/two"):
+        assert run_command(Path("results", path)) == f"hilsplat run --config demo results/{path} {options}"
+    for path in ("synthetic/one/scene", "tables/lerf.csv", "figures/sweep-theta.png"):
+        assert run_command(Path("results", path)) == f"hilsplat run results/{path} {last}"
+    assert run_command(Path("results")) == f"hilsplat run {last}"
+    Path("results/synthetic/two/.run.json").unlink()  # a scene of an earlier version of hilsplat
+    scene = "results/synthetic/two/scene"
+    assert run_command(Path(scene)) == f"hilsplat run {scene} {last}"
 
 
 def test_values_on_the_command_line_are_read_as_snakemake_reads_them(folder, started, monkeypatch):

@@ -10,7 +10,7 @@ from hilsplat.base.artifacts import write_json
 from hilsplat.base.tables import write_csv
 from hilsplat.workflow import run as runs
 from hilsplat.workflow import summary as summaries
-from tests.unit.workflow.plans import plan_of
+from tests.unit.workflow.plans import BENCHMARK, plan_of
 
 ROWS = ("photos desk photos photos metre", "photos chair photos photos metre")
 
@@ -68,7 +68,9 @@ def test_only_held_out_views_are_judged(project, psnr_db, split, words):
 def test_a_scene_without_a_tree_continues_with_a_run(project):
     shutil.rmtree("results/photos/desk/default")
     assert described(project)["next"] == "hilsplat run photos/desk"
-    runs.record_run(Path("results"), [Path("config/mine.yaml")], {"seed": 5})
+    runs.record_run(
+        plan_of(project, ROWS, groups=["photos"]), [Path("config/mine.yaml")], {"seed": 5, "only": ["desk"]}
+    )
     assert (
         described(project)["next"] == "hilsplat run --config config/mine.yaml photos/desk -- --config seed=5"
     )
@@ -97,6 +99,16 @@ def test_a_run_of_files_describes_their_scenes_only(project):
     found = plan_of(project, ROWS, groups=["photos"])
     lines = summaries.summary(found, ["results/photos/chair/scene", "results/tables/lerf.csv"])
     assert [line for line in lines if line.endswith(":")] == ["photos/chair:"]
+
+
+def test_scenes_that_the_tables_of_a_run_leave_out_are_named(project):
+    shutil.copytree("results/photos/desk/scene", "results/synthetic/one/scene")
+    for file in ("tables/lerf.csv", "synthetic/two/default/scores.csv"):
+        Path("results", file).parent.mkdir(parents=True, exist_ok=True)
+        Path("results", file).touch()
+    _, without = summaries.summary(plan_of(project, BENCHMARK, only=["one"]))[-2:]
+    assert "have scores but are not in this run: synthetic/two;" in without
+    assert summaries.summary(plan_of(project, BENCHMARK))[-1] == "tables: results/tables/*.md"
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pytest
 
 from hilsplat.base.artifacts import provenance_path, read_json
 from hilsplat.base.errors import ArtifactError
+from hilsplat.base.progress import stage_log
 from hilsplat.evaluate.costs import read_costs, run_efficiency, write_times
 from hilsplat.evaluate.scores import write_scores
 from hilsplat.evaluate.tables.build import published_values, run_table
@@ -76,6 +77,20 @@ def test_missing_records_and_unread_stages(scene, tmp_path):
     scene[0].with_name("times.csv").unlink()
     with pytest.raises(ArtifactError, match=r"times\.csv is missing"):
         read_costs(scene)
+
+
+def test_times_without_views_from_the_cache_are_named(scene, tmp_path, caplog):
+    caplog.set_level("INFO")
+    for stage, count in (("masks", 12), ("clip", 0)):
+        caplog.clear()
+        with stage_log(stage, "synthetic/table-1") as counts:
+            counts.update(views=35, from_cache=count)
+        log = scene[0].parent / f"logs/{stage}.log"
+        log.parent.mkdir(exist_ok=True)
+        log.write_text(caplog.text)
+    note = "Not measured: the time of views that these jobs read from the cache, as after an interruption: "
+    assert f"- {note}masks of synthetic/table-1.\n" in built("cost-seconds", scene, tmp_path)[1][".md"]
+    assert note not in built("cost", scene, tmp_path)[1][".md"]
 
 
 def built(name, scores, folder, labels=None):

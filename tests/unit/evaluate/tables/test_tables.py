@@ -141,6 +141,26 @@ def test_a_scene_has_one_column_and_rows_over_part_of_the_scenes_say_so(tmp_path
     assert half.count("90.0") == 2 and half.count("**90.0**") == 1  # best in its scene, not on average
 
 
+def test_only_rows_of_comparable_protocols_are_ranked_together(tmp_path):
+    """Values in % of the rows in bold: fields and trees, other rules for maps, masks of files."""
+    values = {
+        "lerf/langsplat@3": (("field", 0.41, "default"), ("field", 0.42, "other")),
+        "lerf/tree-nodes@6": (("tree", 0.43, "default"),),
+        "lerf/paper-mean@3": (("field", 0.51, "default"), ("field", 0.52, "other")),
+        "lerf/langsplat@3 (filter 20)": (("field", 0.61, "default"),),
+        "lerf/langsplat@3 (masks of files)": (("files", 0.71, "a"), ("files", 0.72, "b")),
+        "lerf/paper-mean@3 (masks of files)": (("files", 0.71, "a"), ("files", 0.72, "b")),
+    }
+    scores = [
+        score("iou", value, protocol=protocol, method=method, variant=variant, level="")
+        for protocol, rows in values.items()
+        for method, value, variant in rows
+    ]
+    _, forms = built(tmp_path, "lerf", scores)
+    (*_, block) = forms[".md"].split("## ")
+    assert sorted(re.findall(r"\*\*(\d\d)\.0\*\* \|$", block, re.MULTILINE)) == ["43", "52", "72", "72"]
+
+
 def test_seeds_of_some_scenes_do_not_change_the_mean_over_all(tmp_path):
     scores = [score("iou", 0.3, scene=scene, variant="v", method="field", **LERF) for scene in "abcd"]
     scores.append(score("iou", 0.9, scene="a", variant="v.seed1", method="field", **LERF))
@@ -163,6 +183,42 @@ def test_ablation_rows_take_localization_from_the_flat_protocol(tmp_path):
     assert cells(row, "LERF localization", "L1", "Hi-LERF HC") == ["50.00", "50.00", "60.00"]
     names = [row["method"] for row in rows if row["kind"] != "reported"]
     assert names == ["hilsplat (field)", "hilsplat (tree)", "Omega 2"]
+
+
+def test_ablation_columns_average_the_scenes_of_their_own_tables(tmp_path):
+    """Rows of Hi-LERF and Hi-3DOVS with columns of LERF and 3D-OVS; lawn is averaged, snacks isn't."""
+    lerf, ovs = ("figurines", "ramen", "teatime", "waldo_kitchen"), ("bed", "bench", "room", "sofa", "lawn")
+
+    def flat(data, protocol, values):
+        names = {"dataset": data, "protocol": protocol, "level": ""}
+        return [score("iou", value, scene=scene, **names) for scene, value in values.items()]
+
+    of_lerf = flat("lerf_ovs", "lerf/tree-nodes@6", {**dict.fromkeys(lerf, 0.4), "ramen": 0.8})
+    of_ovs = flat("3d_ovs", "3d-ovs/langsplat@2", {**dict.fromkeys(ovs, 0.5), "snacks": 0.9, "table": 0.9})
+    of_hi = [score("iou", 0.6, scene=scene, dataset="hi_lerf") for scene in lerf]
+    of_hi_ovs = [score("iou", 0.6, scene=scene, dataset="hi_3dovs") for scene in ("bed", "snacks")]
+
+    def columns(name, scores):
+        rows, _ = built(tmp_path / name, "ablation", scores)
+        return {
+            row["data"]: [row.get(name) for name in ("LERF mIoU", "3D-OVS mIoU", "scenes")]
+            for row in rows
+            if row["kind"] == "measured"
+        }
+
+    every = [*of_lerf, *of_ovs, *of_hi, *of_hi_ovs]
+    assert columns("all", every) == {
+        "hi_lerf": ["50.00", "50.00", ""],
+        "hi_3dovs": ["50.00", "50.00", "2 of 10"],
+    }
+    # a row over one scene of LERF, and scores without lawn
+    part = [*of_lerf, *of_ovs[:4], *of_hi[1:2], *of_hi_ovs]
+    assert columns("part", part) == {
+        "hi_lerf": ["80.00", "", "1 of 4"],
+        "hi_3dovs": ["50.00", "50.00", "2 of 10"],
+    }
+    less = columns("less", [*of_lerf[:3], *of_hi, *of_hi_ovs])
+    assert [row[0] for row in less.values()] == [None, None]
 
 
 def ablation_of(tmp_path, values):
