@@ -34,7 +34,7 @@ from hilsplat.base.errors import (
     shorten_list,
 )
 from hilsplat.base.levels import LEVELS
-from hilsplat.base.processes import Shared
+from hilsplat.base.processes import Shared, num_cores
 from hilsplat.base.progress import reporting, track
 from hilsplat.base.removal import delete
 from hilsplat.configuration import resolve_auto, validated
@@ -380,4 +380,4 @@ def _require_seed(seed: int) -> None:
 
 
 def _threads(number: int | None) -> int:
-    return number or os.cpu_count() or 1
+    return number or num_cores()

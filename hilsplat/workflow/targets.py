@@ -1,9 +1,11 @@
 """Targets of a run: tables, their scores, and pictures."""
 
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 
-from hilsplat.base.errors import shorten_list
+from hilsplat.base.errors import ArtifactError, shorten_list
+from hilsplat.base.lineage import read_provenance
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.registry import ANNOTATED, DATASETS
 from hilsplat.datasets.sources import LEVELLED, published
@@ -124,7 +126,7 @@ def tables(plan: Plan) -> list[str]:
 
 
 def of_run(plan: Plan) -> list[str]:
-    """Return the names of the tables with scores of this run, with data that it lacks, or not yet made.
+    """Return the names of the tables with scores of this run, with data that it lacks, or without scores.
 
     The others would lose the measured rows of earlier runs, as would all tables in a run of photographs.
     """
@@ -134,9 +136,16 @@ def of_run(plan: Plan) -> list[str]:
     if not plan.run.only:
         lacking.update(*(DATASETS[name].tables for name in _not_found(plan)))
     paths = {Path(path).stem: Path(path) for path in tables(plan)}
-    return [
-        name for name, path in paths.items() if name in lacking or scores(plan, name) or not path.exists()
-    ]
+    return [name for name in paths if name in lacking or scores(plan, name) or not _has_scores(paths[name])]
+
+
+def _has_scores(table: Path) -> bool:
+    """Return whether a table was made from scores."""
+    with suppress(ArtifactError):  # its record is damaged
+        record = read_provenance(table)
+        read = record.inputs.get("scores") if record else None
+        return bool(read and read.files)
+    return False
 
 
 def left_out(plan: Plan) -> list[str]:

@@ -62,14 +62,14 @@ def test_an_edit_reruns_the_stages_that_import_the_module_and_what_follows(copy_
 
 
 def test_settings_and_models_rerun_the_stages_that_read_them(copy_of_finished: Project) -> None:
-    copy_of_finished.edit("config/config.yaml", "omega: 10", "omega: 5")
+    copy_of_finished.edit("config/config.yaml", "omega: 10 #", "omega: 5 #")
     assert copy_of_finished.planned() == AFTER_FIELD - {"sweep_plot"}  # sweeps are of the paper's method
-    copy_of_finished.edit("config/config.yaml", "theta: 0.9", "theta: 0.8")
+    copy_of_finished.edit("config/config.yaml", "\n  theta: 0.9\n", "\n  theta: 0.8\n")
     by_head = ("--config", "theta_variants=[]", "omega_variants=[]")  # theta decides levels in the others
     rerun = {"coverage_tree", "method"} | AFTER_FIELD
     assert copy_of_finished.planned(*by_head) == rerun - {"sweep_plot"}
-    copy_of_finished.edit("config/config.yaml", "theta: 0.8", "theta: 0.9")
-    copy_of_finished.edit("config/config.yaml", "omega: 5", "omega: 10")
+    copy_of_finished.edit("config/config.yaml", "\n  theta: 0.8\n", "\n  theta: 0.9\n")
+    copy_of_finished.edit("config/config.yaml", "omega: 5 #", "omega: 10 #")
     card = copy_of_finished.root / "models/clip-tiny/config.json"
     card.write_text(card.read_text() + "\n")
     assert copy_of_finished.planned() == FROM_CLIP

@@ -19,6 +19,7 @@ from hilsplat.workflow import targets
 from hilsplat.workflow.models import models_of_photographs, settings_of_photographs
 from hilsplat.workflow.plan import UNCOMPARED, Plan, any_of, without_scene
 from tests.conftest import PROJECT
+from tests.unit.artifact_changes import write_record
 from tests.unit.models.test_store import write_model
 from tests.unit.workflow.plans import BENCHMARK, Job, plan_of, write_sheet
 
@@ -493,7 +494,7 @@ def test_a_run_of_some_scenes_makes_their_tables_and_names_the_scenes_left_out(t
     assert "results/figures/sweep-theta.png" in targets.default(found), "a first run makes all tables"
     for path in map(Path, targets.tables(found)):
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
+        write_record(path, inputs={"scores": {"path": "results", "files": {"results/scores.csv": "0" * 64}}})
     assert tables(found) == ["lerf", "3dovs", "cost", "cost-seconds"]
     assert "results/figures/sweep-theta.png" not in targets.default(found)
     one = plan_of_benchmarks(tmp_path, only=["lerf/ramen"])
