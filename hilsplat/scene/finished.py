@@ -166,14 +166,13 @@ def refining(folder: Path) -> str:
 
 
 def is_drawn(scene: Path) -> bool:
-    """Return whether a `Scene` artifact was made from a generator's renders, which have a record, too."""
+    """Return whether a `Scene` artifact was made from a generator's renders (from its provenance)."""
     record = read_provenance(scene)
     images = record.inputs.get("images") if record else None
-    folder = Path(images.path) if images else Path()
-    if folder.name != "images" or folder.parent.name not in entry_points("hilsplat.generators"):
+    if images is None or images.files is not None:  # each photograph of a user is recorded
         return False
-    beside = scene.parent / folder.parent.name / folder.name  # where they are if the results were moved
-    return any(provenance_path(path).is_file() for path in (folder, beside))
+    folder = Path(images.path)
+    return folder.name == "images" and folder.parent.name in entry_points("hilsplat.generators")
 
 
 def finished_variants(folder: Path) -> list[str]:

@@ -121,13 +121,14 @@ def test_the_embedded_clip_warns_that_it_does_not_know_photographs(copied, caplo
     named = replace(scene, names=NodeNames({0: "the frog"}))
     assert named.caution_about("The frog") == "" and named.caution_about("the frog > nose") == caution
     # the embedded models were trained on synthetic scenes
-    for images in (str(copied / "scene"), "photographs/of/the/world/images"):
-        write_record(copied / "scene", inputs={"images": {"path": images}})
-        assert hilsplat.open_scene(copied).caution == caution
-    write_record(copied / "scene", inputs={"images": {"path": "results/synthetic/x/world/images"}})
-    (copied / "world").mkdir()
-    write_record(copied / "world/images")
-    assert hilsplat.open_scene(copied).caution == ""
+    photographs = {"path": "of/the/world/images", "files": {"of/the/world/images/1.jpg": "0" * 64}}
+    for images, expected in (
+        ({"path": str(copied / "scene")}, caution),
+        (photographs, caution),
+        ({"path": "results/synthetic/x/world/images"}, ""),
+    ):
+        write_record(copied / "scene", inputs={"images": images})
+        assert hilsplat.open_scene(copied).caution == expected
 
 
 def test_the_example_of_the_docs_runs(named_desk, project, monkeypatch, capsys):
