@@ -32,6 +32,14 @@ def component_path(split: Path, tag: str, segment: str) -> Path:
     return split / tag / f"{segment}.parquet"
 
 
+def num_images(path: Path) -> int:
+    """Return the number of rows of component `camera_image`, from the file's footer."""
+    import pyarrow.parquet as parquet
+
+    with decoding(path):
+        return int(parquet.read_metadata(path).num_rows)
+
+
 def read_component(
     split: Path, tag: str, segment: str, columns: list[str], only: dict[str, int] | None = None
 ) -> list[dict[str, Any]]:

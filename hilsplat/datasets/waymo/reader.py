@@ -6,11 +6,13 @@ for float32.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.files import stats_of
 from hilsplat.datasets.dataset import Dataset, SceneReport, listing
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.waymo import parquet, records
@@ -20,7 +22,7 @@ from hilsplat.scene.posed_images import rigid_pose
 SPLITS = ("validation", "training")
 """Splits searched for a segment. Labels of the testing split are not public."""
 LABELS = "lidar_segmentation"
-NUM_IMAGES = 990  # of a segment: 198 frames of five cameras
+IMAGE_BYTES = 1_000_000  # of release 1 per image, with lidar: about 1 GB for 198 frames of five cameras
 
 
 def find_parquet(root: Path, segment: str) -> Path | None:
@@ -96,8 +98,12 @@ class Segments(Dataset):
         return tuple(str(path.relative_to(root)) for path in paths)
 
     def num_images(self, files: Sequence[Path]) -> int:
-        """Return the usual number, because the images are inside the files."""
-        return NUM_IMAGES if files else 0
+        """Return the number of images inside the files, for release 1 from the size of the file."""
+        for path in files:
+            if path.parent.name == parquet.COMPONENTS[0]:
+                with suppress(SceneError):  # reading the segment reports it
+                    return parquet.num_images(path)
+        return sum(stat.st_size for stat in stats_of(files).values()) // IMAGE_BYTES
 
 
 DATASET = Segments(

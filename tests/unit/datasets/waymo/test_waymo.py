@@ -1,5 +1,6 @@
 """Waymo by hand: a range image of one row, a camera with round numbers, records made by protobuf."""
 
+import os
 import struct
 import zlib
 from dataclasses import replace
@@ -155,12 +156,15 @@ def test_a_segments_files_are_inputs_wherever_they_are(root, split):
     files = image_files(f"data:waymo/{SEGMENT}", str(root.parent))
     assert files and {path.parents[1] for path in files} == {root / split}
     assert not [path for path in files if path.parent.name == "lidar_segmentation"]  # evaluation reads it
+    assert DATASETS["waymo"].num_images(files) == len(open_segment(root, SEGMENT).images)
     (root / split).rename(root / "elsewhere")
     record = root / split / RECORD
     record.parent.mkdir()
     record.touch()
     assert image_files(f"data:waymo/{SEGMENT}", str(root.parent)) == (record,)
     assert DATASETS["waymo"].missing(root, SEGMENT) == ()
+    os.truncate(record, 990 * 10**6)
+    assert DATASETS["waymo"].num_images([record]) == 990
 
 
 def test_damaged_components_are_refused_with_a_fix(root):
