@@ -64,7 +64,7 @@ def entry_points(group: str, kind: type = object, taken: tuple[str, ...] = ()) -
     """Return the components that installed packages offer as Python entry points of a group, by name.
 
     Args:
-        kind: class of the components, or of which they are subclasses.
+        kind: class or base class of the components.
         taken: names of built-in components.
 
     Raises:

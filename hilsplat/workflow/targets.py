@@ -46,7 +46,7 @@ def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
 def _of_levels(plan: Plan, rows: list[SceneRow], *, shows_flat: bool) -> list[SceneRow]:
     """Return the scenes whose labels may have levels.
 
-    With `shows_flat`, rows of Hi-LERF also show scores of 3D-OVS, and rows of Hi-3DOVS those of LERF
+    With `shows_flat`, rows of Hi-LERF also have a column of 3D-OVS, and rows of Hi-3DOVS one of LERF
     (`flat_scores`), so these scenes are included if labels of the other data set have levels.
     """
     levelled = {row: _label_sets(plan, row).intersection((*LEVELLED, ANNOTATED)) for row in rows}
@@ -126,7 +126,7 @@ def tables(plan: Plan) -> list[str]:
 
 
 def of_run(plan: Plan) -> list[str]:
-    """Return the names of the tables with scores of this run, with data that it lacks, or without scores.
+    """Return the names of the tables that show this run, list data that it lacks, or have no scores yet.
 
     The others would lose the measured rows of earlier runs, as would all tables in a run of photographs.
     """
@@ -149,7 +149,7 @@ def _has_scores(table: Path) -> bool:
 
 
 def left_out(plan: Plan) -> list[str]:
-    """Return the scenes with scores of earlier runs that the tables of this run would show but leave out."""
+    """Return the scenes that an earlier run scored and the tables of this run would show but leave out."""
     shown, names = {*of_run(plan)}, {row.name for row in plan.scenes}
     others = [row for row in plan.rows if row.name not in names and shown.intersection(tables_of(row))]
     return [row.name for row in others if any(Path(plan.path(row)).glob("*/scores.csv"))]
